@@ -11,11 +11,28 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parent.parent))  # the package of this checkout, whatever is installed
 
 from ftl_lightning.data.features import Feature
-from ftl_lightning.domains.domain import ClosedLoop, Concepts, Domain, Metric, Plans, Show, View
-from ftl_lightning.domains.paper import Paper, Published
+from ftl_lightning.domains.comparison import Comparison, Paper, Published
+from ftl_lightning.domains.domain import Concepts, Domain, Metric, Plans, Privileged, Recordings, View
+from ftl_lightning.domains.execution import ClosedLoop
+from ftl_lightning.domains.pictures import Show
 from ftl_lightning.domains.tasks import EvaluationTask
 
-CLASSES: tuple[type, ...] = (Domain, Plans, Concepts, EvaluationTask, Feature, Metric, Show, ClosedLoop, View, Paper, Published)
+CLASSES: tuple[type, ...] = (
+    Domain,
+    Plans,
+    Concepts,
+    EvaluationTask,
+    Feature,
+    Metric,
+    Show,
+    ClosedLoop,
+    View,
+    Comparison,
+    Paper,
+    Published,
+    Recordings,
+    Privileged,
+)
 PAGE = Path(__file__).parent / "own-domain.md"
 BEGIN, END = "<!-- fields: begin, written by `make fields` -->\n", "<!-- fields: end -->\n"
 
@@ -52,6 +69,8 @@ def _type(annotation: ast.expr) -> str:
 
 
 def _default(field: "dataclasses.Field[object]") -> str:
+    if dataclasses.is_dataclass(field.default_factory):
+        return f"`{field.default_factory.__name__}()`"
     if field.default_factory is not dataclasses.MISSING:
         return f"`{field.default_factory()!r}`"
     if field.default is dataclasses.MISSING:

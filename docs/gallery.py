@@ -16,8 +16,8 @@ sys.path.insert(0, str(Path(__file__).parent.parent))  # the package of this che
 from matplotlib.figure import Figure
 from PIL import Image
 
+from ftl_lightning.domains.films import some
 from ftl_lightning.domains.tasks import EvaluationTask
-from ftl_lightning.domains.vector_film import some
 from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.igm.composition import Composition
 

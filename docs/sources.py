@@ -20,7 +20,7 @@ import pandas as pd
 import yaml
 from safetensors import safe_open
 
-from ftl_lightning.domains.paper import OURS, Compared
+from ftl_lightning.domains.comparison import OURS, Compared
 from ftl_lightning.domains.registry import domain_of_file
 from ftl_lightning.evaluation.results import latest, read_rows
 from ftl_lightning.few_shot.tuned import ModelSettings
@@ -212,8 +212,9 @@ def _paper(given: Mapping[str, Any] | float, rest: Mapping[str, Any]) -> Iterato
         return
     wanted = dict(given)
     domain = domain_of_file(wanted.pop("domain"))
-    if domain.paper:  # texts may name numbers beside which tables put none
-        domain = replace(domain, paper=replace(domain.paper, comparable=True))
+    if domain.comparison.paper:  # texts may name numbers beside which tables put none
+        paper = replace(domain.comparison.paper, comparable=True)
+        domain = replace(domain, comparison=replace(domain.comparison, paper=paper))
     method = Compared(wanted.pop("method", OURS))
     number = lookup(domain, wanted.pop("setting"), wanted.pop("metric", "accuracy"), method=method, **wanted)
     if number is None:

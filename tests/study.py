@@ -12,9 +12,10 @@ from ftl_lightning.apps.study.films import read_films
 from ftl_lightning.apps.study.page import Made, make_study
 from ftl_lightning.apps.study.questions import ask
 from ftl_lightning.data.demonstrations import Demonstrations
-from ftl_lightning.domains.domain import Concepts, Domain, Plans, Show
+from ftl_lightning.domains.domain import Concepts, Domain, Plans
 from ftl_lightning.domains.mocap.rendering import film, picture, wireframe
 from ftl_lightning.domains.mocap.skeleton import COLUMNS
+from ftl_lightning.domains.pictures import Show
 from tests.domains.test_mocap_rendering import waving
 
 TRAINING = ("march", "run", "walk")

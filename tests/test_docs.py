@@ -217,7 +217,7 @@ def test_the_papers_numbers_on_its_page_are_those_of_the_domains() -> None:
             row = {**item.get("all", {}), **chosen}
             if not papers or papers in ONLY_PRINTED:
                 continue
-            of = domain_of_file(row.get("domain", Path(row["file"]).stem)).paper
+            of = domain_of_file(row.get("domain", Path(row["file"]).stem)).comparison.paper
             assert of is not None
             subject = (row["setting"], row["method"], row.get("metric", ""))
             same = [one for one in of.numbers if (one.setting, one.method, one.metric) == subject]

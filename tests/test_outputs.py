@@ -22,7 +22,7 @@ from PIL import Image
 
 from ftl_lightning.apps.study.answers import read_key
 from ftl_lightning.cli.main import main
-from ftl_lightning.domains.line_plots import picture
+from ftl_lightning.domains.pictures import line_drawings
 from ftl_lightning.evaluation.animation import captioned
 from ftl_lightning.evaluation.results import append_rows, read_rows
 from ftl_lightning.evaluation.row import Row
@@ -305,7 +305,7 @@ def test_texts_of_figures_are_no_formulas_and_none_is_left_out_and_long_ones_are
 
     assert figure_text("_hidden") == " _hidden"
     assert len(figure_text("long " * 1000)) <= 120
-    figure = picture(["$x$", "_y"] * 2)(torch.zeros(2, 5, 4), None, r"go to $\frac{$" + "\x1b[2J", None)
+    figure = line_drawings(["$x$", "_y"] * 2).picture(torch.zeros(2, 5, 4), None, r"go to $\frac{$" + "\x1b[2J", None)
     figure.savefig("f.png")
     legend = figure.axes[0].get_legend()
     assert legend is not None

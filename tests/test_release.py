@@ -249,7 +249,7 @@ import torch
 from ftl_lightning import Composition, Concept, Demonstrations, FewShot, list_models
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.domain import Concepts, Domain, Metric, Plans
-from ftl_lightning.domains.generated import Generated
+from ftl_lightning.domains.domain import Generated
 from ftl_lightning.domains.tasks import few_shot_suites
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.few_shot.learned_concept import LearnedConcept

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ftl_lightning.apps.testing.families import beats, pictures, reaches
-from ftl_lightning.domains.object_rearrangement.generation import random_scenes
-from ftl_lightning.domains.object_rearrangement.relations import columns, overlap
+from ftl_lightning.domains.object_rearrangement.scenes import columns, overlap, random_scenes
 
 TEMPLATES, TEMPLATE_SEED = 80, 990
 """Samples of each kind that a judge compares with."""

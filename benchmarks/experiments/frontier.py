@@ -20,8 +20,8 @@ import torch
 
 from ftl_lightning.apps.lightning_cli import parse
 from ftl_lightning.data.demonstrations import Demonstrations, concatenate
+from ftl_lightning.domains.comparison import OURS, PAPERS_METHOD, WITH_MODES, Compared
 from ftl_lightning.domains.domain import COVERAGE, NOVELTY, Domain
-from ftl_lightning.domains.paper import OURS, PAPERS_METHOD, WITH_MODES, Compared
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.evaluation.diversity import Real, lines, real_behaviour
 from ftl_lightning.evaluation.generation import Generation, generate

@@ -9,9 +9,11 @@ from torch import Tensor
 
 from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.data.features import Feature, InitialStates, Observed, check_starts
-from ftl_lightning.domains import line_plots
-from ftl_lightning.domains.domain import ClosedLoop, Concepts, Domain, Frames, Metric, Plans, Split
-from ftl_lightning.domains.rollout import Rollout
+from ftl_lightning.domains import pictures
+from ftl_lightning.domains.comparison import Comparison
+from ftl_lightning.domains.domain import Concepts, Domain, Metric, Plans, Split
+from ftl_lightning.domains.execution import ClosedLoop, Rollout
+from ftl_lightning.domains.films import Frames
 from ftl_lightning.domains.tasks import few_shot_suites
 from ftl_lightning.services.seeding import VALIDATION_SEED, generator, task_key
 
@@ -94,7 +96,7 @@ def judge(goal: str, rollout: Rollout) -> dict[str, Tensor]:
 
 def film(rollout: Rollout, plans: Tensor) -> Frames:
     """The way of one episode."""
-    return line_plots.film(rollout.observed["world"][0, :, :2])
+    return pictures.film(rollout.observed["world"][0, :, :2])
 
 
 def random_target(goal: str, count: int, starts: InitialStates | None, seed: int) -> Tensor:
@@ -111,7 +113,6 @@ DOMAIN = Domain(
     source=lambda root: Expert(),
     observed={"world": WORLD},
     metrics={"accuracy": Metric(arrives)},
-    headline="closed loop success",
-    references={"random target": random_target},
+    comparison=Comparison(headline="closed loop success", references={"random target": random_target}),
     closed_loop=ClosedLoop(environment=PushEnvironment, act=act, steps=20, judge=judge, film=film),
 )

@@ -6,8 +6,7 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.data.features import InitialStates
-from ftl_lightning.domains.domain import Concepts, Domain, Metric, Plans
-from ftl_lightning.domains.generated import Generated
+from ftl_lightning.domains.domain import Concepts, Domain, Generated, Metric, Plans
 from ftl_lightning.domains.tasks import few_shot_suites
 from ftl_lightning.services.seeding import generator, task_key
 

@@ -88,9 +88,9 @@ def prepare(domain: str, root: str = "", out: str = "") -> None:
     from ftl_lightning.services.errors import UserError
 
     loaded = load_domain(domain)
-    if loaded.prepare is None:
+    if loaded.recordings.prepare is None:
         raise UserError(f"domain: expected one whose recordings are prepared, found {domain!r}, which needs nothing of the kind")
-    say(loaded.prepare(Path(root) if root else None, Path(out) if out else None))
+    say(loaded.recordings.prepare(Path(root) if root else None, Path(out) if out else None))
 
 
 def concepts(pretrained: str, folder: list[str] = [], plain: bool = False) -> None:  # noqa: B006 (never changed)

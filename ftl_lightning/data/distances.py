@@ -1,5 +1,6 @@
 """Distances between behaviours, for novelty and coverage."""
 
+import math
 from collections.abc import Callable
 
 import torch
@@ -36,3 +37,31 @@ def scaled_distance(real: Tensor, resolution: float = 0.0) -> Distance:
     spread = real.flatten(0, 1).std(dim=0, correction=0)
     spread = torch.where(spread > resolution, spread, 1)
     return lambda states, others: path_distance(states / spread, others / spread)
+
+
+def warped_distances(states: Tensor, lengths: Tensor, others: Tensor, other_lengths: Tensor) -> Tensor:
+    """Mean distance per step after dynamic time warping (Sakoe & Chiba, 1978).
+
+    Args:
+        states: ``(n, time, state)``.
+        lengths: ``(n,)``.
+        others: ``(m, other time, state)``.
+        other_lengths: ``(m,)``.
+
+    Returns:
+        ``(n, m)``: the minimum sum of Euclidean distances along a warping path, divided by the longer length.
+    """
+    total = []
+    for path, length in zip(states, lengths.tolist(), strict=True):
+        cost = torch.cdist(path[None, :length].expand(len(others), -1, -1), others)  # (m, length, other time)
+        far = torch.full((len(others),), math.inf)
+        before = torch.full((len(others), cost.shape[2] + 1), math.inf)
+        before[:, 0] = 0
+        for row in cost.unbind(dim=1):
+            here = [far]
+            for column in range(cost.shape[2]):
+                here.append(row[:, column] + torch.minimum(torch.minimum(before[:, column], before[:, column + 1]), here[-1]))
+            before = torch.stack(here, dim=1)
+        ends = before.gather(1, other_lengths[:, None])[:, 0]
+        total.append(ends / other_lengths.clamp(min=length))
+    return torch.stack(total)

@@ -1,63 +1,57 @@
-"""What a domain is: one object in a few groups. Adding a domain adds such an object, here or in a package of one's own.
+"""Interface of domains: a :class:`Domain` is one object, made of a few groups of fields.
 
-Name, plans, concepts and source are required; everything else has a default.
+A domain is declared in a module of this package or of the user. Name, plans, concepts and source are required; every other field
+has a default.
 """
 
 import difflib
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+import importlib
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol, Self, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from ftl_lightning.data.demonstrations import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations, padded
 from ftl_lightning.data.distances import Distance
 from ftl_lightning.data.features import Feature, InitialStates, Observed
-from ftl_lightning.domains import line_plots
-from ftl_lightning.domains.paper import PAPERS_METHOD, Compared, Paper
-from ftl_lightning.domains.rollout import Rollout
+from ftl_lightning.domains.comparison import Comparison
+from ftl_lightning.domains.execution import ClosedLoop, Rollout
+from ftl_lightning.domains.pictures import Show, line_drawings
+from ftl_lightning.domains.recorder import Recorder
 from ftl_lightning.domains.tasks import Suite, training_suite
-from ftl_lightning.services.errors import UserError, short, shown
+from ftl_lightning.services.errors import UserError, require, short, shown
 from ftl_lightning.services.representation import Shown, counted
-
-if TYPE_CHECKING:
-    import gymnasium
-    from matplotlib.figure import Figure
-
-    from ftl_lightning.domains.recorder import Recorder
-    from ftl_lightning.domains.vector_film import VectorFilm
-    from ftl_lightning.domains.wireframe import Wireframe
+from ftl_lightning.services.seeding import VALIDATION_SEED
 
 ACCURACY = "accuracy"
 SUCCESS = "success"
 NOVELTY, COVERAGE = "novelty", "coverage"
-"""Distances of generated plans to demonstrations and of fresh behaviour to generated plans, in every domain, see
-:mod:`ftl_lightning.evaluation.diversity`; a metric of a domain's own by one of these names stands in its place."""
+"""Distances of generated plans to demonstrations, and of fresh behaviour to generated plans, see
+:mod:`ftl_lightning.evaluation.diversity`. They are measured in every domain; a domain's metric of this name takes precedence."""
 CLOSED = "closed loop"
 EXECUTED = f"{CLOSED} {SUCCESS}"
 Split = Literal["train", "validation"]
-Frames = list[NDArray[np.uint8]]
-"""Pictures ``(height, width, 3)``."""
+_DERIVED: Any = None  # default of a field that is derived from other fields
 
 
 @dataclass(frozen=True)
 class Plans:
-    """The behaviour that is generated.
+    """Behaviour to generate.
 
     Attributes:
         horizon: number of states in a plan.
         columns, units: name and unit of each column of a state.
-        start_exponent: where training windows as long as a plan start in a demonstration: ``start = length * share^start_exponent``
-            with a uniform ``share``. 1 is uniform; with 3 half of the windows start in the first eighth, for plans that cover the
-            whole behaviour. Shorter windows start anywhere.
-        at_rest: whether behaviour is at rest at the end of a demonstration. Windows may then reach past the end, where the last
-            state is repeated; otherwise they stay within demonstrations that are long enough.
-        groups: named groups of columns, such as the legs of a body; a composition may restrict a concept to some of them.
-        resolution: columns of states and observed vectors that vary by less than this, in their units, count as constant.
+        start_exponent: distribution of the start of training windows as long as a plan: ``start = length * share^start_exponent``
+            with a uniform ``share``. 1 is uniform. With 3, half of the windows start in the first eighth of a demonstration, for
+            plans that cover the whole behaviour. Shorter windows start anywhere.
+        at_rest: whether behaviour rests at the end of a demonstration. If so, windows may reach past the end, where the last state
+            is repeated. If not, windows stay within demonstrations, which must be long enough.
+        groups: groups of columns by name, such as the legs of a body. A composition may restrict a concept to some groups.
+        resolution: smallest variation of a column of states or observed vectors, in its unit; columns that vary by less count as
+            constant.
     """
 
     horizon: int
@@ -69,44 +63,41 @@ class Plans:
     groups: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
 
     def grouped(self, names: Sequence[str]) -> tuple[int, ...]:
-        """Columns of some groups.
+        """Columns of groups.
 
         Raises:
-            UserError: for a name that is none.
+            UserError: for an unknown name of a group.
         """
-        if unknown := [name for name in names if name not in self.groups]:
-            told = f"one of {', '.join(self.groups)}" if self.groups else "no group of columns, as this domain names none"
-            raise UserError(f"compose: expected {told} after '@', found {unknown[0]!r}")
+        known = f"one of {', '.join(self.groups)}" if self.groups else "no group of columns, as this domain names none"
+        for name in names:
+            require(name in self.groups, "compose", f"{known} after '@'", repr(name))
         return tuple(column for name in names for column in self.groups[name])
 
     def exponent(self, window: int) -> float:
-        """That of windows of this length."""
+        """``start_exponent`` for windows of this length."""
         return self.start_exponent if window >= self.horizon else 1.0
-
-
-_UNSAID: Any = None  # default of a field whose value follows from the others where it is not said
 
 
 @dataclass(frozen=True)
 class Concepts:
-    """The behaviour's concepts, in words.
+    """Concepts of a domain, in words.
 
     Attributes:
         training: texts of the training concepts.
-        suites: evaluation tasks by name of the suite: ``'training'`` (training concepts), ``'validation'`` (for tuning),
-            ``'paper'`` (final evaluation only), or any other. ``invert`` learns the suite ``'paper'`` unless ``data.suite`` says
-            otherwise. By default the training concepts alone.
-        descriptions: every text in the table of embeddings besides the empty one; by default the training concepts and the suites'
-            goals.
-        reads: whether a text is a goal that behaviour can be judged by; by default, whether it is one of the descriptions.
-        sentence: turns a goal into the sentence that a language model embeds; by default the goal itself.
-        table: file with the embeddings of all descriptions, made by ``encode``; ``None`` where none ships.
+        suites: suites of evaluation tasks by name: ``'training'`` (training concepts), ``'validation'`` (for tuning), ``'paper'``
+            (final evaluation only), or any other name. ``invert`` learns the concepts of ``data.suite``, by default those of the
+            suite ``'paper'``. By default, the only suite is that of the training concepts.
+        descriptions: texts in the table of embeddings, without the empty text; by default the training concepts and the goals of
+            all suites.
+        reads: whether a text is a goal that the metrics can judge; by default, whether it is one of the descriptions.
+        sentence: conversion of a goal to the sentence that a language model embeds; by default the goal itself.
+        table: file with the embeddings of all descriptions, written by ``encode``; ``None`` for none.
     """
 
     training: tuple[str, ...]
     suites: Mapping[str, Suite] = field(default_factory=dict)
     descriptions: tuple[str, ...] = ()
-    reads: Callable[[str], bool] = _UNSAID
+    reads: Callable[[str], bool] = _DERIVED
     sentence: Callable[[str], str] = str
     table: Path | None = None
 
@@ -116,46 +107,87 @@ class Concepts:
         if not self.descriptions:
             texts = dict.fromkeys((*self.training, *(goal for suite in self.suites.values() for goal in suite.goals)))
             object.__setattr__(self, "descriptions", tuple(texts))
-        if self.reads is _UNSAID:
+        if self.reads is _DERIVED:
             object.__setattr__(self, "reads", frozenset(self.descriptions).__contains__)
 
 
 class Source(Protocol):
-    """Where demonstrations come from: an expert, a generator, a folder of files."""
+    """Source of demonstrations, such as an expert, a generator or a folder of files."""
 
     def split(self, name: Split, count: int, seed: int) -> Demonstrations:
-        """``count`` demonstrations of every training concept; those of ``'validation'`` are in no training split."""
+        """``count`` demonstrations of each training concept. The splits have no demonstration in common."""
         ...
 
     def draw(self, task: str, count: int, seed: int, workers: int = 1) -> Demonstrations:
-        """Demonstrations of any task; the same task, count and seed give the same bytes, whatever the number of processes."""
+        """Demonstrations of any task. The same task, count and seed give the same bytes for any number of processes."""
         ...
 
     def starts(self, task: str, count: int, seed: int) -> InitialStates | None:
-        """New initial states of a task; ``None`` where behaviour has none."""
+        """New initial states of a task; ``None`` if plans have no initial states."""
         ...
 
 
 @runtime_checkable
 class Recoveries(Protocol):
-    """A source that also has demonstrations which begin where behaviour went wrong."""
+    """Source that also has demonstrations of recovery, which begin where behaviour went wrong."""
 
     def recoveries(self, name: Split, count: int, seed: int) -> Demonstrations:
-        """``count`` of every training concept of which there are some; those of ``'validation'`` are in no training split."""
+        """``count`` recoveries of each training concept that has any. The splits have no demonstration in common."""
         ...
 
 
 @dataclass(frozen=True)
-class Metric:
-    """How generated plans are judged.
+class Generated:
+    """Source of demonstrations that a function generates from a seed, for domains without initial states.
 
     Attributes:
-        measure: ``(goal, states (sample, horizon, state), initial states or None) -> (sample,)`` of bool (right or wrong) or of
-            numbers; or one number ``()`` for the whole set, such as a distance between distributions. NaN where it says nothing
-            of a plan or a goal: such plans do not count, and where it says nothing at all it is not reported.
+        name: name of the domain.
+        plans: plans of the domain, with the columns of the states.
+        training: training concepts.
+        states: ``(task, count, seed) -> (demo, time, state)`` float32, or a ``(time, state)`` per demonstration if their lengths
+            differ. The same arguments must give the same bytes.
+    """
+
+    name: str
+    plans: Plans
+    training: tuple[str, ...]
+    states: Callable[[str, int, int], Iterable[Tensor]]
+
+    def split(self, name: Split, count: int, seed: int) -> Demonstrations:
+        """``count`` demonstrations of each training concept; ``'validation'`` uses separate seeds."""
+        return self._demonstrations(self.training, count, seed if name == "train" else VALIDATION_SEED + seed)
+
+    def draw(self, task: str, count: int, seed: int, workers: int = 1) -> Demonstrations:
+        """``count`` demonstrations of a task, in this process."""
+        return self._demonstrations((task,), count, seed)
+
+    def starts(self, task: str, count: int, seed: int) -> None:
+        """``None``: behaviour has no initial states."""
+
+    def _demonstrations(self, tasks: Sequence[str], count: int, seed: int) -> Demonstrations:
+        states, lengths = padded([rows for task in tasks for rows in self.states(task, count, seed)])
+        return Demonstrations(
+            states=states,
+            lengths=lengths,
+            domain=self.name,
+            state_names=self.plans.columns,
+            state_units=self.plans.units,
+            concepts=tuple(task for task in tasks for _ in range(count)),
+            provenance={"generator": self.name, "seed": seed, "count_per_task": count},
+        )
+
+
+@dataclass(frozen=True)
+class Metric:
+    """Measure of generated plans.
+
+    Attributes:
+        measure: ``(goal, states (sample, horizon, state), initial states or None) -> (sample,)``, of bool (right or wrong) or of
+            numbers; or a single number ``()`` for the whole set, such as a distance between distributions. Return NaN for not
+            applicable: such plans are excluded from the mean, and a metric without any other value is not reported.
         less_is_better: whether a smaller value is better.
-        identity: what the values depend on besides the code, such as the hash of a trained judge's weights. It is part of the
-            configuration's hash; empty for a rule.
+        identity: description of what the values depend on besides the code, such as the hash of a judge's weights; empty for a
+            rule. It is part of the configuration's hash.
     """
 
     measure: Callable[[str, Tensor, InitialStates | None], Tensor]
@@ -164,106 +196,24 @@ class Metric:
 
 
 @dataclass(frozen=True)
-class Show:
-    """Pictures of plans.
-
-    Attributes:
-        picture: ``(states (sample, horizon, state), right (sample,) of bool or None if not judged, title, initial states or None)
-            -> figure``.
-        film: ``states (horizon, state) -> frames`` of one plan; ``None`` where a plan is not a motion.
-        wireframe: ``states (horizon, state) -> moving points and lines``, from which a web page draws the same film in a twentieth
-            of its size; ``None`` where a plan cannot be drawn in this way.
-        vector_film: ``(states (horizon, state), initial state or None) -> shapes that move``, which ``report --html`` shows;
-            ``None`` for those of the wireframe, if there is one.
-        beside: ``(demonstrations (demo, horizon, state), samples (sample, horizon, state), title, right (sample,) of bool or None)
-            -> figure`` of both on one scale; ``None`` for one picture above the other.
-        exports: by the ending of a file, such as ``'.bvh'``, ``states (horizon, state) -> text`` of one plan for other programs
-            (``sample --export``); empty where none reads such behaviour.
-    """
-
-    picture: Callable[[Tensor, Sequence[bool] | None, str, InitialStates | None], "Figure"]
-    film: Callable[[Tensor], Frames] | None = None
-    wireframe: Callable[[Tensor], "Wireframe"] | None = None
-    vector_film: "Callable[[Tensor, InitialStates | None], VectorFilm] | None" = None
-    beside: Callable[[Tensor, Tensor, str, Sequence[bool] | None], "Figure"] | None = None
-    exports: Mapping[str, Callable[[Tensor], str]] = field(default_factory=dict)
-
-
-def line_drawings(plans: Plans) -> Show:
-    """Pictures of behaviour of which nothing but its columns is known, see :mod:`ftl_lightning.domains.line_plots`.
-
-    Paths in two or three dimensions are also filmed.
-    """
-    film = line_plots.film if len(plans.columns) in (2, 3) else None
-    drawn = line_plots.path_film if len(plans.columns) == 2 else line_plots.line_film
-    return Show(line_plots.picture(plans.columns), film, vector_film=drawn, beside=line_plots.beside(plans.columns))
-
-
-Policy = Callable[[Observed, list[int], int], Tensor]
-"""``(observed (episode, *shape) by name, which episodes, step) -> actions (episode, action)``; not finite where there is none."""
-
-
-@dataclass(frozen=True)
-class ClosedLoop:
-    """How a domain executes plans.
-
-    Attributes:
-        environment: makes a Gymnasium environment. Its observations are the domain's observed features by name; its ``reset`` takes
-            ``options={'scene': (scene,)}``. ``judge`` also receives the ``info`` of its last step.
-        act: the planner: ``(plans (episode, horizon, state), steps since the plans were made, observed (episode, *shape) by name)
-            -> actions (episode, action)``.
-        steps: maximum number of steps in an episode.
-        judge: ``(goal, rollout) -> outcomes`` by name, each ``(episode,)``. One of them is ``'success'``, of bool.
-        film: ``(rollout of one episode, plans (step, horizon, state) that were followed) -> frames``; ``None`` where episodes are
-            not filmed.
-        vector_film: ``rollout of one episode -> shapes that move``, which ``report --html`` shows; ``None`` for no film.
-        keeps: names of the observed features that ``judge`` and films need; all where empty.
-        less_is_better: names of the outcomes of which a smaller value is better, such as ``'crash'``.
-        identity: what outcomes depend on besides the code, such as the planner's name. It is part of the configuration's hash; may
-            be empty.
-        others: more environments by name, such as one with another planner. ``evaluation.environments`` chooses those in which
-            plans are also executed.
-        policies: reference lines that act step by step, by name: ``(goal, initial states, demonstrations that the concept was
-            learned from or None, seed) -> policy``, or ``None`` where it would take too long.
-        expect: raises a :class:`~ftl_lightning.services.errors.UserError` if the environment lacks a package; called
-            before any work.
-    """
-
-    environment: "Callable[[], gymnasium.Env[Any, Any]]"
-    act: Callable[[Tensor, int, Observed], Tensor]
-    steps: int
-    judge: Callable[[str, Rollout], dict[str, Tensor]]
-    film: Callable[[Rollout, Tensor], Frames] | None = None
-    vector_film: "Callable[[Rollout], VectorFilm] | None" = None
-    keeps: tuple[str, ...] = ()
-    less_is_better: tuple[str, ...] = ()
-    identity: str = ""
-    others: "Mapping[str, Callable[[], gymnasium.Env[Any, Any]]]" = field(default_factory=dict)
-    policies: Mapping[str, Callable[[str, InitialStates, Demonstrations | None, int], Policy | None]] = field(default_factory=dict)
-    expect: Callable[[], None] = lambda: None
-
-    def inside(self, name: str) -> Self:
-        """How plans are executed in another environment; in the domain's own for the empty name."""
-        return replace(self, environment=self.others[name]) if name else self
-
-
-@dataclass(frozen=True)
 class View:
-    """How a model sees behaviour, where this differs from what files hold.
+    """Alternative representation of behaviour for a model; files and metrics keep the domain's representation.
 
     Attributes:
-        features: the features that the model observes, by name.
-        observe: turns the domain's observed features into these features.
-        encode: ``(states (sample, horizon, state), observed) -> (sample, horizon, state)``, what the model generates.
-        decode: the inverse of ``encode``; of generated states that are impossible, it returns the nearest possible ones.
-        perturb: ``(states, observed, generator) -> (states, observed)`` with a slightly different present state, used in training:
-            it teaches recovery from states outside the demonstrations. Without a generator it only hides what a new task will not
-            show. ``None`` for no perturbation.
-        act: a planner for plans in this view, as ``act`` of :class:`ClosedLoop`; ``None`` for the domain's planner.
+        features: features that the model observes, by name.
+        observe: conversion of the domain's observed features to these features.
+        encode: conversion of states to what the model generates: ``(states (sample, horizon, state), observed) -> (sample, horizon,
+            state)``.
+        decode: inverse of ``encode``; projects impossible generated states to the nearest possible ones.
+        perturb: augmentation in training, ``(states, observed, generator) -> (states, observed)`` with a slightly different present
+            state, from which a model learns to recover. Without a generator, it only hides what new tasks do not show. ``None`` for
+            none.
+        act: planner for plans in this view, as ``act`` of :class:`~ftl_lightning.domains.execution.ClosedLoop`; ``None`` for the
+            domain's planner.
         scales: groups of columns of a state; columns at the same position in each group share a scale.
         same_columns: whether encoded states have the same columns as the domain's states.
-        plane: columns of an encoded state that are x and y in the coordinates of what is seen as points: a denoiser may turn plans
-            together with these.
+        plane: columns of an encoded state that are x and y in the coordinates of observed points; a denoiser may rotate plans and
+            points together.
     """
 
     features: Mapping[str, Feature]
@@ -279,13 +229,13 @@ class View:
 
 @dataclass(frozen=True)
 class Privileged:
-    """Something that training demonstrations show and that is not observed later, such as where objects are.
+    """Quantity in training demonstrations that is not observed later, such as the positions of objects.
 
     Attributes:
-        feature: a vector.
-        error: ``(read (sample, n), feature (sample, *shape)) -> (sample,)``, how wrong what was read of an image is.
-        told: ``(feature (sample, *shape), draw) -> (sample, n)``, what an encoder of images might read of one that shows this,
-            with errors as it makes them; ``None`` where nobody can say.
+        feature: shape of the quantity, a vector.
+        error: error of a prediction by an image encoder: ``(prediction (sample, n), feature (sample, *shape)) -> (sample,)``.
+        told: simulated prediction with realistic errors, in place of an encoded image: ``(feature (sample, *shape), generator) ->
+            (sample, n)``; ``None`` for none.
     """
 
     feature: Feature
@@ -293,67 +243,59 @@ class Privileged:
     told: Callable[[Tensor, torch.Generator], Tensor] | None = None
 
 
-def _expect(what: str, values: object, shapes: Sequence[tuple[int, ...]]) -> None:
-    if not isinstance(values, Tensor) or tuple(values.shape) not in shapes:
-        found = f"shape {tuple(values.shape)}" if isinstance(values, Tensor) else type(values).__name__
-        raise UserError(f"{what}: expected a tensor of shape {' or '.join(map(str, shapes))}, found {found}")
+@dataclass(frozen=True)
+class Recordings:
+    """Recording and import of demonstrations.
+
+    Attributes:
+        prepare: conversion of the user's copy of a data set (``python -m ftl_lightning prepare``): ``(folder to read or None,
+            folder to write or None for the same) -> text to print``; ``None`` if none is needed.
+        recorder: recorder of demonstrations with a pointer; ``None`` if behaviour cannot be shown in this way.
+        imports: readers of other programs' files by ending, such as ``'.bvh'``: ``file -> demonstrations`` without a text.
+    """
+
+    prepare: Callable[[Path | None, Path | None], str] | None = None
+    recorder: Recorder | None = None
+    imports: Mapping[str, Callable[[Path], Demonstrations]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, repr=False)
 class Domain(Shown):
-    """A domain.
+    """Domain of behaviour.
 
     Attributes:
-        name: the name under which its package offers it, see :func:`ftl_lightning.domains.registry.load_domain`.
-        plans: the behaviour that is generated.
+        name: name of the domain in files and of its entry point, see :func:`~ftl_lightning.domains.registry.load_domain`.
+        plans: behaviour to generate.
         concepts: texts of the concepts, and suites of evaluation tasks.
-        source: makes the source of demonstrations, given the folder of the user's data or ``None``.
-        show: pictures of plans; by default lines over time, or paths where a state has two or three columns.
-        observed: features that a plan is conditioned on, by name; empty where plans have no initial state.
-        privileged: what training demonstrations show beside these, by name: the encoder of images can be taught by it in
-            pretraining (``model.privileged``). No model observes it.
-        metrics: how plans are judged in open loop, by name; the first is the one that ablations report. Empty where behaviour is
-            judged in closed loop only.
-        ours: our method in the form that others are compared with; the paper's by default.
-        headline: what methods are compared by: the name of a metric, or ``'closed loop '`` and an outcome.
-        references: reference lines (trivial policies and oracles) by name: ``(goal, samples, initial states or None, seed) ->
-            states (sample, horizon, state)``.
-        views: ways in which a model may see behaviour, by name; without any, the model sees states as they are.
-        closed_loop: how plans are executed; ``None`` where they cannot be.
-        distance: between plans, for novelty and coverage: ``(states (a, horizon, state), others (b, horizon, state)) -> (a, b)``;
-            ``None`` for the root mean square over the plan's times, columns scaled by their spread.
-        fresh: whether the source draws demonstrations of any goal quickly enough to do so in every evaluation; otherwise coverage
-            is not measured.
-        paper: published numbers, if there are any.
-        prepare: ``(folder of the user's copy of the data, folder to write or None for the same) -> text to print``, for recordings
-            that are read once before they are used; see ``python -m ftl_lightning prepare``.
-        recorder: how a person shows behaviour with a pointer, see :mod:`ftl_lightning.domains.recorder`; ``None`` where nobody can.
-        imports: by the ending of a file of other programs, such as ``'.bvh'``, ``file -> demonstrations`` without a text.
+        source: constructor of the source of demonstrations, from the folder of the user's data or ``None``.
+        show: pictures of plans; by default paths in two or three dimensions, otherwise lines over time.
+        observed: features that plans are conditioned on, by name; empty if plans have no initial state.
+        metrics: measures of plans in open loop, by name; ablations report the first. Empty if behaviour is judged in closed loop
+            only.
+        closed_loop: execution of plans; ``None`` for a domain without an environment.
+        views: alternative representations of behaviour for models, by name. A model without a view sees states as they are.
+        comparison: standards that results are compared with.
+        recordings: recording and import of demonstrations.
+        privileged: quantities in training demonstrations that are not observed, by name. Pretraining can train image encoders to
+            predict them (``model.privileged``).
     """
 
     name: str
     plans: Plans
     concepts: Concepts
     source: Callable[[Path | None], Source]
-    show: Show = _UNSAID
+    show: Show = _DERIVED
     observed: Mapping[str, Feature] = field(default_factory=dict)
-    privileged: Mapping[str, Privileged] = field(default_factory=dict)
     metrics: Mapping[str, Metric] = field(default_factory=dict)
-    ours: Compared = PAPERS_METHOD
-    headline: str = ACCURACY
-    references: Mapping[str, Callable[[str, int, InitialStates | None, int], Tensor]] = field(default_factory=dict)
-    views: Mapping[str, View] = field(default_factory=dict)
     closed_loop: ClosedLoop | None = None
-    distance: Distance | None = None
-    fresh: bool = True
-    paper: Paper | None = None
-    prepare: Callable[[Path | None, Path | None], str] | None = None
-    recorder: "Recorder | None" = None
-    imports: Mapping[str, Callable[[Path], Demonstrations]] = field(default_factory=dict)
+    views: Mapping[str, View] = field(default_factory=dict)
+    comparison: Comparison = field(default_factory=Comparison)
+    recordings: Recordings = field(default_factory=Recordings)
+    privileged: Mapping[str, Privileged] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if self.show is _UNSAID:
-            object.__setattr__(self, "show", line_drawings(self.plans))
+        if self.show is _DERIVED:
+            object.__setattr__(self, "show", line_drawings(self.plans.columns))
 
     def _words(self) -> Iterator[str]:
         yield repr(self.name)
@@ -367,55 +309,53 @@ class Domain(Shown):
             yield f"executed for up to {counted(self.closed_loop.steps, 'step')}"
 
     def measure(self, goal: str, states: Tensor, starts: InitialStates | None) -> dict[str, Tensor]:
-        """What each metric says of plans ``(sample, horizon, state)``, by name.
+        """Values of all metrics for plans ``(sample, horizon, state)``, by name.
 
         Raises:
-            UserError: for a metric that returns neither a number for each plan nor one for all of them.
+            UserError: for a metric that returns neither a number per plan nor a single number.
         """
         measured = {name: metric.measure(goal, states, starts) for name, metric in self.metrics.items()}
         for name, values in measured.items():
-            _expect(f"domain {self.name}, metric {name!r}", values, ((len(states),), ()))
+            _check_shape(f"domain {self.name}, metric {name!r}", values, ((len(states),), ()))
         return measured
 
     def distances(self, states: Tensor, others: Tensor, distance: Distance) -> Tensor:
-        """Between plans ``(a, horizon, state)`` and others ``(b, horizon, state)``: ``(a, b)``.
-
-        Plans that are not finite are infinitely far from all others.
+        """Distances ``(a, b)`` between plans ``(a, horizon, state)`` and ``(b, horizon, state)``; infinite for plans not finite.
 
         Args:
-            states, others: of one shape but for their numbers.
-            distance: the domain's, or what stands for it.
+            states: plans.
+            others: plans of the same horizon and columns.
+            distance: the domain's distance, or its replacement.
 
         Raises:
-            UserError: for plans of different shapes, or a distance that returns something else.
+            UserError: for plans of different shapes, or a distance that returns another shape.
         """
-        _expect(f"domain {self.name}, distance", others, ((len(others), *states.shape[1:]),))
+        _check_shape(f"domain {self.name}, distance", others, ((len(others), *states.shape[1:]),))
         distances = distance(states, others)
-        _expect(f"domain {self.name}, distance", distances, ((len(states), len(others)),))
+        _check_shape(f"domain {self.name}, distance", distances, ((len(states), len(others)),))
         return distances.nan_to_num(nan=torch.inf, posinf=torch.inf)
 
     def judge(self, goal: str, rollout: Rollout) -> dict[str, Tensor]:
-        """What happened in episodes, by name ``(episode,)``.
+        """Outcomes of episodes ``(episode,)`` by name.
 
         Raises:
-            UserError: for a domain without an environment, or a judge that returns something else or no success.
+            UserError: for a domain without an environment, or a judge that returns another shape or no success.
         """
         outcomes = closed_loop_of(self).judge(goal, rollout)
         if not isinstance(outcomes, Mapping) or SUCCESS not in outcomes:
-            told = ", ".join(outcomes) if isinstance(outcomes, Mapping) else type(outcomes).__name__
-            raise UserError(f"domain {self.name}, judge: expected outcomes by name, {SUCCESS!r} among them, found {told}")
+            found = ", ".join(outcomes) if isinstance(outcomes, Mapping) else type(outcomes).__name__
+            raise UserError(f"domain {self.name}, judge: expected outcomes by name, {SUCCESS!r} among them, found {found}")
         for name, values in outcomes.items():
-            _expect(f"domain {self.name}, outcome {name!r}", values, ((len(rollout.failed),),))
+            _check_shape(f"domain {self.name}, outcome {name!r}", values, ((len(rollout.failed),),))
         return dict(outcomes)
 
     def check_goal(self, goal: str, key: str = "goal") -> None:
-        """Refuse a goal that the domain cannot read.
+        """Refuse a goal that the domain cannot judge.
 
         Raises:
-            UserError: naming the nearest goals that it knows.
+            UserError: with the most similar known goals.
         """
-        if not isinstance(goal, str):
-            raise UserError(f"{key}: expected a text, such as {shown(self.concepts.training[0])}, found {shown(goal)}")
+        require(isinstance(goal, str), key, f"a text, such as {shown(self.concepts.training[0])}", shown(goal))
         if not self.concepts.reads(goal):
             known = [text for text in self.concepts.descriptions if self.concepts.reads(text)]
             near = difflib.get_close_matches(goal, known, n=5, cutoff=0.4) or known[:5]
@@ -423,7 +363,7 @@ class Domain(Shown):
 
     @property
     def main_metric(self) -> str:
-        """What ablations are about: the first metric of plans, or success where only what comes of them is judged."""
+        """Metric of ablations: the first metric of plans, or success in closed loop for a domain without metrics."""
         return next(iter(self.metrics), EXECUTED)
 
     def less_is_better(self, metric: str) -> bool:
@@ -431,17 +371,33 @@ class Domain(Shown):
         if metric == COVERAGE and metric not in self.metrics:
             return True
         if (outcome := metric.removeprefix(f"{CLOSED} ")) != metric:
-            outcome = outcome.partition(" (")[0]  # the environment
+            outcome = outcome.partition(" (")[0]  # without the environment
             return self.closed_loop is not None and outcome in self.closed_loop.less_is_better
         return metric in self.metrics and self.metrics[metric].less_is_better
 
 
 def closed_loop_of(domain: Domain) -> ClosedLoop:
-    """How a domain executes plans.
+    """Execution of plans in a domain.
 
     Raises:
-        UserError: for one that cannot.
+        UserError: for a domain without an environment.
     """
     if domain.closed_loop is None:
         raise UserError(f"execute: expected a domain with an environment, found {domain.name}, which has none")
     return domain.closed_loop
+
+
+def deferred(reference: str) -> Callable[..., Any]:
+    """Function imported at its first call, such as a plot: importing matplotlib takes half a second.
+
+    Args:
+        reference: ``'package.module:function'``.
+    """
+    module, _, name = reference.partition(":")
+    return lambda *arguments: getattr(importlib.import_module(module), name)(*arguments)
+
+
+def _check_shape(place: str, values: object, shapes: Sequence[tuple[int, ...]]) -> None:
+    found = f"shape {tuple(values.shape)}" if isinstance(values, Tensor) else type(values).__name__
+    fits = isinstance(values, Tensor) and tuple(values.shape) in shapes
+    require(fits, place, f"a tensor of shape {' or '.join(map(str, shapes))}", found)

@@ -31,11 +31,13 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.data.demonstrations import Demonstrations
+from ftl_lightning.data.distances import warped_distances
 from ftl_lightning.data.features import InitialStates
-from ftl_lightning.domains.domain import Concepts, Domain, Metric, Plans, Split
-from ftl_lightning.domains.hand_drawn import drawn_by_hand
+from ftl_lightning.domains.comparison import Comparison
+from ftl_lightning.domains.domain import Concepts, Domain, Metric, Plans, Recordings, Split
 from ftl_lightning.domains.recognition import Recognition
-from ftl_lightning.services.errors import UserError, about, short
+from ftl_lightning.domains.recorder import drawn_by_hand
+from ftl_lightning.services.errors import about, require, short
 from ftl_lightning.services.seeding import generator
 
 OWN = "own"
@@ -65,12 +67,9 @@ class FileSource:
         Raises:
             UserError: if there are fewer.
         """
-        known = self.demonstrations.select(task) if task in self.demonstrations.concepts else None
-        if known is None or len(known) < count:
-            raise UserError(
-                f"task: expected {count} demonstrations of {task!r} in the file, found {0 if known is None else len(known)}"
-            )
-        return known.rows(list(range(count)))
+        rows = _rows(self.demonstrations, task)
+        require(len(rows) >= count, "task", f"{count} demonstrations of {task!r} in the file", len(rows))
+        return self.demonstrations.rows(rows[:count])
 
     def starts(self, task: str, count: int, seed: int) -> InitialStates | None:
         """Initial states of held-out demonstrations, drawn with replacement."""
@@ -99,24 +98,22 @@ def own_domain(
     Raises:
         UserError: for an unknown metric.
     """
-    if unknown := set(metrics) - set(METRICS):
-        raise UserError(f"data.metrics: expected some of {', '.join(METRICS)}, found {', '.join(sorted(unknown))}")
-    texts = tuple(dict.fromkeys(examples.concepts))
-    every = source or FileSource(examples, torch.ones(len(examples), dtype=torch.bool))
+    unknown = sorted(set(metrics) - set(METRICS))
+    require(not unknown, "data.metrics", f"some of {', '.join(METRICS)}", ", ".join(unknown))
+    source = source or FileSource(examples, torch.ones(len(examples), dtype=torch.bool))
     return Domain(
         name=OWN,
         plans=Plans(horizon, examples.state_names, examples.state_units),
-        concepts=Concepts(
-            training=tuple(training),
-            reads=lambda text: text in texts,
-        ),
-        source=lambda root: every,
+        concepts=Concepts(training=tuple(training), reads=frozenset(examples.concepts).__contains__),
+        source=lambda root: source,
         observed=examples.features,
         metrics={name: METRICS[name](examples, horizon, number) for name, number in metrics.items()},
-        headline=next(iter(metrics), ""),
-        distance=partial(_warped, examples),
-        fresh=False,  # the file is all there is
-        recorder=drawn_by_hand(examples, horizon),
+        comparison=Comparison(
+            headline=next(iter(metrics), ""),
+            distance=partial(_distance, examples),
+            fresh=False,  # the file is all there is
+        ),
+        recordings=Recordings(recorder=drawn_by_hand(examples, horizon)),
     )
 
 
@@ -134,13 +131,12 @@ def domain_from_file(path: str, horizon: int | None, metrics: Mapping[str, float
     """
     demonstrations = read_own(path)
     training = tuple(dict.fromkeys(demonstrations.concepts))
-    if len(training) < 2:
-        raise UserError(f"{path}: key 'concepts': expected texts of two concepts or more to pretrain on, found {len(training)}")
+    expected = "texts of two concepts or more to pretrain on"
+    require(len(training) >= 2, f"{path}: key 'concepts'", expected, len(training))
     held_out = torch.zeros(len(demonstrations), dtype=torch.bool)
     for text in training:
-        rows = [row for row, concept in enumerate(demonstrations.concepts) if concept == text]
-        if len(rows) < 2:
-            raise UserError(f"{path}: concept {text!r}: expected two demonstrations or more (one is held out), found 1")
+        rows = _rows(demonstrations, text)
+        require(len(rows) >= 2, f"{path}: concept {text!r}", "two demonstrations or more (one is held out)", len(rows))
         held_out[rows[-max(1, math.floor(share * len(rows))) :]] = True
     source = FileSource(demonstrations, held_out)
     longest = int(demonstrations.lengths.max())
@@ -167,72 +163,44 @@ def read_demonstrations(path: str, domain: Domain) -> Demonstrations:
         UserError: naming the file, if it does not fit the domain.
     """
     demonstrations = read_own(path)
-    columns = len(domain.plans.columns)
-    if demonstrations.domain not in ("", domain.name):
-        raise UserError(f"{path}: key 'domain': expected {domain.name!r}, found {short(demonstrations.domain)!r}")
-    if demonstrations.states.shape[2] != columns:
-        raise UserError(f"{path}: key 'states': expected shape (demo, time, {columns}), found {tuple(demonstrations.states.shape)}")
+    columns, found = len(domain.plans.columns), tuple(demonstrations.states.shape)
+    known = demonstrations.domain in ("", domain.name)
+    require(known, f"{path}: key 'domain'", repr(domain.name), repr(short(demonstrations.domain)))
+    require(found[2] == columns, f"{path}: key 'states'", f"shape (demo, time, {columns})", str(found))
     with about(path):
         return demonstrations.fitted(domain.observed)
 
 
-def _scaled(examples: Demonstrations, states: Tensor) -> tuple[Tensor, Tensor]:
-    """Scale columns to standard deviation 1 over the examples; constant columns stay unscaled."""
+def _rows(demonstrations: Demonstrations, concept: str) -> list[int]:
+    return [row for row, text in enumerate(demonstrations.concepts) if text == concept]
+
+
+def _goal_rows(examples: Demonstrations, goal: str) -> list[int]:
+    rows = _rows(examples, goal)
+    require(rows, "goal", "a concept with demonstrations to compare with", repr(goal))
+    return rows
+
+
+def _scaled(examples: Demonstrations, states: Tensor) -> Tensor:
+    """Scale columns by their standard deviation over the examples; constant columns stay unscaled."""
     spread = examples.states.flatten(0, 1).std(dim=0)
-    spread = torch.where(spread > 0, spread, 1)
-    return examples.states / spread, states / spread
-
-
-def warped_distances(states: Tensor, lengths: Tensor, others: Tensor, other_lengths: Tensor) -> Tensor:
-    """Mean distance per step after dynamic time warping (Sakoe & Chiba, 1978).
-
-    Args:
-        states: ``(n, time, state)``.
-        lengths: ``(n,)``.
-        others: ``(m, other time, state)``.
-        other_lengths: ``(m,)``.
-
-    Returns:
-        ``(n, m)``: the minimum sum of Euclidean distances along a warping path, divided by the longer length.
-    """
-    total = []
-    for path, length in zip(states, lengths.tolist(), strict=True):
-        cost = torch.cdist(path[None, :length].expand(len(others), -1, -1), others)  # (m, length, other time)
-        far = torch.full((len(others),), math.inf)
-        before = torch.full((len(others), cost.shape[2] + 1), math.inf)
-        before[:, 0] = 0
-        for row in cost.unbind(dim=1):
-            here = [far]
-            for column in range(cost.shape[2]):
-                here.append(row[:, column] + torch.minimum(torch.minimum(before[:, column], before[:, column + 1]), here[-1]))
-            before = torch.stack(here, dim=1)
-        ends = before.gather(1, other_lengths[:, None])[:, 0]
-        total.append(ends / other_lengths.clamp(min=length))
-    return torch.stack(total)
+    return states / torch.where(spread > 0, spread, 1)
 
 
 def _whole(states: Tensor) -> Tensor:
     return torch.full((len(states),), states.shape[1])
 
 
-def _warped(examples: Demonstrations, states: Tensor, others: Tensor) -> Tensor:
-    """:func:`warped_distances` ``(a, b)`` of whole plans, columns scaled as in :func:`_nearest_demonstration`."""
-    (_, rows), (_, columns) = (_scaled(examples, each) for each in (states, others))
+def _distance(examples: Demonstrations, states: Tensor, others: Tensor) -> Tensor:
+    """:func:`~ftl_lightning.data.distances.warped_distances` ``(a, b)`` of whole plans with scaled columns."""
+    rows, columns = _scaled(examples, states), _scaled(examples, others)
     if len(columns) < len(rows):  # loop over the smaller set
         return warped_distances(columns, _whole(columns), rows, _whole(rows)).T
     return warped_distances(rows, _whole(rows), columns, _whole(columns))
 
 
-def _goal_rows(examples: Demonstrations, goal: str) -> list[int]:
-    rows = [row for row, text in enumerate(examples.concepts) if text == goal]
-    if not rows:
-        raise UserError(f"goal: expected a concept with demonstrations to compare with, found {goal!r}")
-    return rows
-
-
 def _recognised(examples: Demonstrations, horizon: int, number: float) -> Metric:
-    if not 0 < number <= 1:
-        raise UserError(f"data.metrics.recognised: expected a share of real demonstrations above 0, at most 1, found {number:g}")
+    require(0 < number <= 1, "data.metrics.recognised", "a share of real demonstrations above 0, at most 1", f"{number:g}")
     known = cache(lambda: Recognition(examples, horizon, number))  # fitted on first use
 
     def measure(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
@@ -242,35 +210,39 @@ def _recognised(examples: Demonstrations, horizon: int, number: float) -> Metric
     return Metric(measure, identity=examples.hash)
 
 
-def _nearest_demonstration(examples: Demonstrations, horizon: int, number: float) -> Metric:
-    count = int(number)
-    if count < 1:
-        raise UserError(f"data.metrics.nearest_demonstration: expected 1 or more neighbours, found {number:g}")
+def _nearest(name: str, examples: Demonstrations, number: float, distances: Callable[[Tensor], Tensor]) -> Metric:
+    """Whether most of the nearest examples are of the goal.
+
+    Args:
+        name: name of the metric.
+        examples: demonstrations of all concepts.
+        number: number of nearest examples.
+        distances: ``states (n, horizon, state) -> (n, example)``.
+    """
+    require(number >= 1, f"data.metrics.{name}", "1 or more neighbours", f"{number:g}")
+    count = min(int(number), len(examples))
 
     def measure(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
-        known, scaled = _scaled(examples, states)
-        near = warped_distances(scaled, _whole(states), known[:, :horizon], examples.lengths.clamp(max=horizon))
         of_goal = torch.zeros(len(examples), dtype=torch.bool)
         of_goal[_goal_rows(examples, goal)] = True
-        return of_goal[near.topk(min(count, len(examples)), largest=False).indices].float().mean(dim=1) > 0.5
+        return of_goal[distances(states).topk(count, largest=False).indices].float().mean(dim=1) > 0.5
 
     return Metric(measure, identity=examples.hash)
+
+
+def _nearest_demonstration(examples: Demonstrations, horizon: int, number: float) -> Metric:
+    known, lengths = _scaled(examples, examples.states)[:, :horizon], examples.lengths.clamp(max=horizon)
+
+    def distances(states: Tensor) -> Tensor:
+        return warped_distances(_scaled(examples, states), _whole(states), known, lengths)
+
+    return _nearest("nearest_demonstration", examples, number, distances)
 
 
 def _nearest_shape(examples: Demonstrations, horizon: int, number: float) -> Metric:
-    count = int(number)
-    if count < 1:
-        raise UserError(f"data.metrics.nearest_shape: expected 1 or more neighbours, found {number:g}")
     times = torch.arange(horizon).clamp(max=examples.states.shape[1] - 1)
     known = _shapes(examples.states[:, times])
-
-    def measure(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
-        of_goal = torch.zeros(len(examples), dtype=torch.bool)
-        of_goal[_goal_rows(examples, goal)] = True
-        near = torch.cdist(_shapes(states), known).topk(min(count, len(examples)), largest=False).indices
-        return of_goal[near].float().mean(dim=1) > 0.5
-
-    return Metric(measure, identity=examples.hash)
+    return _nearest("nearest_shape", examples, number, lambda states: torch.cdist(_shapes(states), known))
 
 
 def _shapes(states: Tensor) -> Tensor:
@@ -288,18 +260,18 @@ def _end_point_within(examples: Demonstrations, horizon: int, number: float) -> 
     return Metric(measure, identity=examples.hash)
 
 
-def _to_demonstrations(examples: Demonstrations, horizon: int, goal: str, states: Tensor) -> Tensor:
-    rows = _goal_rows(examples, goal)
-    lengths = examples.lengths[rows].clamp(max=horizon)
-    return warped_distances(states, _whole(states), examples.states[rows, :horizon], lengths).amin(dim=1)
+def _dtw_to_demonstrations(examples: Demonstrations, horizon: int, number: float) -> Metric:
+    def measure(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
+        rows = _goal_rows(examples, goal)
+        lengths = examples.lengths[rows].clamp(max=horizon)
+        return warped_distances(states, _whole(states), examples.states[rows, :horizon], lengths).amin(dim=1)
+
+    return Metric(measure, less_is_better=True, identity=examples.hash)
 
 
 def _dtw_within(examples: Demonstrations, horizon: int, number: float) -> Metric:
-    return Metric(lambda goal, states, starts: _to_demonstrations(examples, horizon, goal, states) <= number, False, examples.hash)
-
-
-def _dtw_to_demonstrations(examples: Demonstrations, horizon: int, number: float) -> Metric:
-    return Metric(lambda goal, states, starts: _to_demonstrations(examples, horizon, goal, states), True, examples.hash)
+    distance = _dtw_to_demonstrations(examples, horizon, number).measure
+    return Metric(lambda goal, states, starts: distance(goal, states, starts) <= number, identity=examples.hash)
 
 
 METRICS: dict[str, Callable[[Demonstrations, int, float], Metric]] = {

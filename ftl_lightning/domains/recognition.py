@@ -16,7 +16,7 @@ the roughness decide.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, reduce
 
 import torch
 from torch import Tensor
@@ -136,7 +136,16 @@ class _Concept:
         return cls(mean[0], variance * wider, mean[1], 1 / (diagonal * wider), scaled, inverse, float(volume), mean[2])
 
     def distances(self, features: _Features, resting: float) -> tuple[Tensor, Tensor]:
-        """-2 log-likelihood ``(n,)`` up to a constant; deviations in place, size, shape, roughness and rest ``(n, 5)``, about 1."""
+        """Distances of behaviour from the concept.
+
+        Args:
+            features: features of ``n`` plans.
+            resting: deviation that counts as rest, in spreads of the columns.
+
+        Returns:
+            -2 log-likelihood ``(n,)`` up to a constant, and deviations ``(n, 5)`` in place, size, shape, roughness and rest, each
+            about 1 for typical behaviour.
+        """
         far = (features.position - self.position) ** 2 / self.variance
         apart = features.shape - self.shape
         along = apart @ self.loadings.T
@@ -179,10 +188,7 @@ class Recognition:
         for row, concept in enumerate(examples.concepts):
             self.rows.setdefault(concept, []).append(row)
         self.within = {concept: _Within.of(self.known.rows(rows)) for concept, rows in self.rows.items()}
-        zero = _Within(torch.zeros(self.known.position.shape[1]), torch.zeros(self.known.shape.shape[1]), 0)
-        self.total = zero
-        for within in self.within.values():
-            self.total = self.total.plus(within)
+        self.total = reduce(_Within.plus, self.within.values())
         if not self.total.freedom:  # single examples: use the variation between concepts
             self.total = _Within.of(self.known)
         self.concepts = {concept: _Concept.of(self.known.rows(rows), self.total) for concept, rows in self.rows.items()}

@@ -1,17 +1,18 @@
-"""Recording of demonstrations with a pointer: scenes, movable pieces and conversion of paths."""
+"""Recording of demonstrations with a pointer: scenes, movable pieces, and conversion of paths and drawn lines."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import InitialStates
-from ftl_lightning.domains.vector_film import VectorFilm
-from ftl_lightning.services.errors import UserError, shown
+from ftl_lightning.domains.films import VectorFilm, still
+from ftl_lightning.services.errors import require, shown
 
 Kind = Literal["draw", "arrange", "steer"]
 Numbers = NDArray[np.float64]
@@ -20,6 +21,15 @@ MOST_STEPS = 20_000
 """Maximum number of steps in a path: more than five minutes at 60 per second."""
 AROUND = 4.0
 """Maximum distance of a path from the window, in widths and heights of the window."""
+FINEST = 20_000
+"""Maximum number of points of a line during smoothing."""
+MARGIN = 0.15
+"""Margin of the window around the examples, relative to their extent."""
+SHORTEST = 0.02
+"""Minimum length of a line, relative to the window's width."""
+PIXEL = 1 / 400
+"""Approximate size of a screen pixel relative to the window's width; scale of smoothing."""
+FRAME = "#dfe3e8"
 
 
 @dataclass(frozen=True)
@@ -96,20 +106,17 @@ def check_path(scene: Scene, path: Any, seconds: Any) -> tuple[Numbers, Numbers]
     """
     pieces = max(len(scene.pieces), 1)
     places, times = _numbers("path", path), _numbers("seconds", seconds)
-    if places.ndim != 3 or places.shape[1:] != (pieces, 2) or not len(places):
-        raise UserError(f"path: expected places of shape (step, {pieces}, 2), found {places.shape}")
-    if len(places) > MOST_STEPS:
-        raise UserError(f"path: expected at most {MOST_STEPS:,} steps, found {len(places):,}; show it more quickly")
-    if times.shape != places.shape[:1]:
-        raise UserError(f"seconds: expected a time for each of {len(places):,} steps, found shape {times.shape}")
-    if not (np.isfinite(places).all() and np.isfinite(times).all()):
-        raise UserError("path and seconds: expected finite numbers, found others")
-    if (np.diff(times) < 0).any():
-        raise UserError("seconds: expected times that never go back, found some that do")
+    fits = places.ndim == 3 and places.shape[1:] == (pieces, 2) and len(places)
+    require(fits, "path", f"places of shape (step, {pieces}, 2)", str(places.shape))
+    count = len(places)
+    require(count <= MOST_STEPS, "path", f"at most {MOST_STEPS:,} steps", f"{count:,}; show it more quickly")
+    require(times.shape == (count,), "seconds", f"a time for each of {count:,} steps", f"shape {times.shape}")
+    require(np.isfinite(places).all() and np.isfinite(times).all(), "path and seconds", "finite numbers", "others")
+    require((np.diff(times) >= 0).all(), "seconds", "times that never go back", "some that do")
     left, lower, width, height = scene.film.window
     away = np.abs((places - (left + width / 2, lower + height / 2)) / (width, height)).max()
-    if away > 0.5 + AROUND:
-        raise UserError(f"path: expected places near what is in sight, found one {away:.3g} times its size from its middle")
+    found = f"one {away:.3g} times its size from its middle"
+    require(away <= 0.5 + AROUND, "path", "places near what is in sight", found)
     return places, times
 
 
@@ -118,6 +125,72 @@ def _numbers(key: str, values: Any) -> Numbers:
         array = np.asarray(values)
     except (TypeError, ValueError):  # lists of different lengths
         array = np.empty(0, dtype=object)
-    if array.dtype.kind not in "fiu":
-        raise UserError(f"{key}: expected numbers in lists of equal lengths, found {shown(values)}")
+    require(array.dtype.kind in "fiu", key, "numbers in lists of equal lengths", shown(values))
     return array.astype(np.float64)
+
+
+def reached(line: Numbers) -> Numbers:
+    """Arc length at each point ``(point,)`` of a line ``(point, 2)``; the last is the line's length."""
+    return np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))))
+
+
+def at_even_steps(line: Numbers, count: int) -> Numbers:
+    """Resample a line to points ``(count, 2)`` at even steps, including its ends; pauses of the hand vanish."""
+    far = reached(line)
+    wanted = np.linspace(0, far[-1], count)
+    return np.stack([np.interp(wanted, far, column) for column in line.T], axis=-1)
+
+
+def smoothed(line: Numbers, blur: float) -> Numbers:
+    """Smooth a line along its length; its ends stay.
+
+    Args:
+        line: ``(point, 2)``.
+        blur: standard deviation of the Gaussian weights along the line, in its unit.
+    """
+    count = min(int(np.ceil(2 * reached(line)[-1] / blur)) + 2, FINEST)  # two points per blur
+    even = at_even_steps(line, count)
+    reach = min(6, count - 1)  # three times the blur
+    weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / 2) ** 2)
+    # Extend the line by point reflection at its ends, so that the ends stay.
+    before, after = 2 * even[:1] - even[reach:0:-1], 2 * even[-1:] - even[-2 : -2 - reach : -1]
+    whole = np.concatenate((before, even, after))
+    return np.stack([np.convolve(column, weights / weights.sum(), mode="valid") for column in whole.T], axis=-1)
+
+
+def drawn_by_hand(examples: Demonstrations, horizon: int) -> Recorder | None:
+    """Recorder of drawn lines; ``None`` if behaviour is not a line in a plane.
+
+    Args:
+        examples: demonstrations, which determine the window.
+        horizon: states of a plan and of a drawn line.
+    """
+    if examples.states.shape[2] != 2 or horizon < 2 or examples.observed:
+        return None
+    covered = torch.cat([states[:length] for states, length in zip(examples.states, examples.lengths.tolist(), strict=True)])
+    low, high = covered.amin(dim=0).double().numpy(), covered.amax(dim=0).double().numpy()
+    middle, side = (low + high) / 2, max(float((high - low).max()), 1e-6)
+    corners = middle + side / 2 * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)])
+    half = side * (0.5 + MARGIN)
+    window = (float(middle[0]) - half, float(middle[1]) - half, 2 * half, 2 * half)
+    empty = Scene(VectorFilm((still("line", corners, FRAME),), window, 1.0))
+
+    def record(scene: Scene, path: Numbers, seconds: Numbers) -> Demonstrations:
+        line, width = path[:, 0], scene.film.window[2]
+        length, expected = reached(line)[-1], f"one longer than {SHORTEST:.0%} of the window"
+        require(length >= SHORTEST * width, "line", expected, f"{length / width:.1%}; draw it again")
+        # Even steps along the line, not in time: the speed of the hand is accidental, and states would accumulate at pauses.
+        states = at_even_steps(smoothed(line, PIXEL * width), horizon)
+        return Demonstrations(
+            states=torch.from_numpy(states).float()[None],
+            lengths=torch.tensor([horizon]),
+            domain=examples.domain,
+            state_names=examples.state_names,
+            state_units=examples.state_units,
+            concepts=("",),
+            provenance={"generator": "by hand"},
+        )
+
+    return Recorder(
+        "draw", "Draw one line of the kind that you mean; how fast you draw does not matter.", lambda task, seed: empty, record
+    )

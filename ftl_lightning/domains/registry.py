@@ -4,7 +4,7 @@ import functools
 import importlib
 
 from ftl_lightning.domains.domain import Domain
-from ftl_lightning.services.errors import UserError, short
+from ftl_lightning.services.errors import UserError, require, short
 from ftl_lightning.services.trust import OPTION, entry_points, is_vouched
 
 GROUP = "ftl_lightning.domains"
@@ -35,7 +35,7 @@ def load_domain(name: str) -> Domain:
     if not colon:
         raise _unknown(name)
     try:
-        domain = getattr(importlib.import_module(module), attribute)
+        domain: Domain = getattr(importlib.import_module(module), attribute)
     except UserError:
         raise
     except Exception as error:  # any error of the imported module
@@ -43,8 +43,7 @@ def load_domain(name: str) -> Domain:
         message = str(error) if known else f"{type(error).__name__}: {error}"
         mend = "install its package or mend the name" if known else "mend its module"
         raise UserError(f"domain {name!r}: cannot be imported ({message}); {mend}") from error
-    if not isinstance(domain, Domain):
-        raise UserError(f"domain {name!r}: expected a Domain, found {type(domain).__name__}")
+    require(isinstance(domain, Domain), f"domain {name!r}", "a Domain", type(domain).__name__)
     return domain
 
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.errors import require
 
 WITHOUT_WEIGHT = -0.5
 """Guidance weight of the texts in ``without``."""
@@ -39,12 +39,12 @@ class EvaluationTask:
     initial: Literal["new", "demonstrated", "last"] = "new"
 
     def __post_init__(self) -> None:
+        place = f"evaluation task {self.goal!r}"
         for key in ("learned", "texts", "without"):
-            if not isinstance(names := getattr(self, key), tuple):
-                raise UserError(f"evaluation task {self.goal!r}: {key}: expected a tuple of names, found {names!r}")
-        if len(self.learned) != 1 and (self.component is not None or self.initial != "new"):
-            key = "component" if self.component is not None else "initial"
-            raise UserError(f"evaluation task {self.goal!r}: {key}: expected one learned concept, found {len(self.learned)}")
+            names = getattr(self, key)
+            require(isinstance(names, tuple), f"{place}: {key}", "a tuple of names", repr(names))
+        special = "component" if self.component is not None else "initial" if self.initial != "new" else ""
+        require(not special or len(self.learned) == 1, f"{place}: {special}", "one learned concept", len(self.learned))
 
     @property
     def name(self) -> str:

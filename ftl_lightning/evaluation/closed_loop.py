@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.data.features import InitialStates, Observed, moved, take
-from ftl_lightning.domains.domain import ClosedLoop, Policy
-from ftl_lightning.domains.rollout import Rollout
+from ftl_lightning.domains.execution import ClosedLoop, Policy, Rollout
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.services.errors import UserError

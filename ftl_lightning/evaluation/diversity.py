@@ -87,8 +87,8 @@ class Real:
 
     def _distance(self, behaviour: Demonstrations) -> Distance:
         """The domain's distance, or a distance with columns scaled by real behaviour."""
-        if self.domain.distance is not None:
-            return self.domain.distance
+        if self.domain.comparison.distance is not None:
+            return self.domain.comparison.distance
         return scaled_distance(self._windows(behaviour), self.domain.plans.resolution)
 
     def _windows(self, demonstrations: Demonstrations) -> Tensor:
@@ -188,7 +188,7 @@ def lines(real: Sequence[Real]) -> dict[str, list[TaskResult]]:
 
 def _drawn(domain: Domain, goal: str, count: int, root: Path | None, seed: int) -> Demonstrations | None:
     """Draw fresh samples of a goal; ``None`` if the domain cannot."""
-    if not domain.fresh or not domain.concepts.reads(goal):
+    if not domain.comparison.fresh or not domain.concepts.reads(goal):
         return None
     key = (domain.name, goal, count, root, seed)
     if key not in _DRAWN:

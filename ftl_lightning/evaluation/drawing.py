@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 from lightning.pytorch.loggers import TensorBoardLogger
 
 from ftl_lightning.data.demonstrations import Demonstrations
-from ftl_lightning.domains.beside import Drawn, beside
 from ftl_lightning.domains.domain import Domain
+from ftl_lightning.domains.pictures import Drawn, beside
 from ftl_lightning.evaluation.animation import outcome_text
 from ftl_lightning.evaluation.evaluable import demonstrations_of
 from ftl_lightning.evaluation.judged import TaskResult, share

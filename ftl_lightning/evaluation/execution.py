@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ftl_lightning.data.features import InitialStates
-from ftl_lightning.domains.domain import ClosedLoop, Domain, closed_loop_of
-from ftl_lightning.domains.rollout import Rollout
+from ftl_lightning.domains.domain import Domain, closed_loop_of
+from ftl_lightning.domains.execution import ClosedLoop, Rollout
 from ftl_lightning.evaluation.animation import captioned, gif, outcome_text
 from ftl_lightning.evaluation.closed_loop import PlanFollower, planner, roll_out, sampled_plans
 from ftl_lightning.igm.composition import Composition

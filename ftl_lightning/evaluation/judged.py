@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.data.features import InitialStates, join
-from ftl_lightning.domains.domain import CLOSED, SUCCESS, Domain, Policy, closed_loop_of
-from ftl_lightning.domains.rollout import Rollout
+from ftl_lightning.domains.domain import CLOSED, SUCCESS, Domain, closed_loop_of
+from ftl_lightning.domains.execution import Policy, Rollout
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.evaluation.closed_loop import roll_out
 
@@ -102,8 +102,8 @@ def paired(generated: TaskResult, reference: TaskResult, policy: str, domain: Do
     Returns:
         Episodes won and lost by metric name, in each environment in which both acted.
     """
-    name = domain.headline.removeprefix(f"{CLOSED} ")
-    decisive = name if name != domain.headline else SUCCESS
+    name = domain.comparison.headline.removeprefix(f"{CLOSED} ")
+    decisive = name if name != domain.comparison.headline else SUCCESS
     episodes: dict[str, Tensor] = {}
     for outcome, by_method in generated.outcomes.items():
         if outcome in reference.outcomes and (outcome == decisive or outcome.startswith(f"{decisive} (")):

@@ -5,8 +5,8 @@ from typing import Any
 
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import InitialStates, check_starts
-from ftl_lightning.domains.domain import ClosedLoop, Domain
-from ftl_lightning.domains.rollout import Rollout
+from ftl_lightning.domains.domain import Domain
+from ftl_lightning.domains.execution import ClosedLoop, Rollout
 from ftl_lightning.evaluation.closed_loop import PlanFollower, fixed_plans, roll_out
 from ftl_lightning.evaluation.evaluable import demonstrations_of
 from ftl_lightning.evaluation.judged import TaskResult
@@ -34,7 +34,9 @@ def references(
         environments: alternative environments in which the method's behaviour was executed.
     """
     loop = None if all(behaviour.rollout is None for behaviour in judged) else domain.closed_loop
-    by_policy = {name: [_planned(name, like, domain, loop, seed, environments) for like in judged] for name in domain.references}
+    by_policy = {
+        name: [_planned(name, like, domain, loop, seed, environments) for like in judged] for name in domain.comparison.references
+    }
     if loop is not None:
         for name in loop.policies:
             acted = (_acted(name, like, domain, loop, demonstrated, seed, environments) for like in judged)
@@ -49,7 +51,7 @@ def _planned(
     task, starts, (count, _, columns) = like.task, like.starts, like.states.shape
     key = (name, domain.name, task.goal, count, _hash(starts), seed)
     if key not in _KNOWN:
-        _KNOWN[key] = domain.references[name](task.goal, count, starts, seed)
+        _KNOWN[key] = domain.comparison.references[name](task.goal, count, starts, seed)
     plans = _KNOWN[key]
     if (expected := (count, domain.plans.horizon, columns)) != tuple(plans.shape):
         raise UserError(f"domain {domain.name}, reference {name!r}: expected plans {expected}, found {tuple(plans.shape)}")

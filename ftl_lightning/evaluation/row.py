@@ -15,7 +15,7 @@ class Row:
     Attributes:
         domain, setting, task: evaluated task.
         method: name of the method, for example ``'FTL-IGM'`` or ``'BC'``, or of the reference line.
-        form: form of the method, see :class:`~ftl_lightning.domains.paper.Compared`; empty for the paper's.
+        form: form of the method, see :class:`~ftl_lightning.domains.comparison.Compared`; empty for the paper's.
         variant: label of settings of the same method and form, for example ``'entities, free'``; may be empty.
         role: :data:`METHOD` or :data:`REFERENCE`.
         K: number of concept components; 0 without learning.

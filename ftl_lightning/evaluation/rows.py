@@ -108,7 +108,7 @@ def rows(
         task = behaviour.task
         subject = {"domain": domain.name, "setting": task.setting, "task": task.name, "seed": hparams["seed"]}
         # Reference policies use demonstrations, reference plans do not.
-        given = demonstrations_of(task, module.demonstrated) if source["method"] not in domain.references else None
+        given = demonstrations_of(task, module.demonstrated) if source["method"] not in domain.comparison.references else None
         subject["demonstrations"] = 0 if given is None else len(given)
         count = len(behaviour.states)
         return [Row(**subject, **source, n=count, metric=name, value=round(value, 6)) for name, value in values.items()]

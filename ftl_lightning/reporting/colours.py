@@ -5,7 +5,7 @@ The colours are Okabe and Ito's (2008) and Tol's (2021), which are safe for colo
 
 from collections.abc import Iterable, Mapping
 
-from ftl_lightning.domains.paper import CHOSEN, FINE_TUNED, OURS, PAPERS_METHOD, WITH_ADAPTER, WITH_KNOTS, WITH_MODES, Compared
+from ftl_lightning.domains.comparison import CHOSEN, FINE_TUNED, OURS, PAPERS_METHOD, WITH_ADAPTER, WITH_KNOTS, WITH_MODES, Compared
 
 _MODES_OVER_TIME = f"{WITH_MODES} {WITH_KNOTS}"
 OF_METHODS: Mapping[Compared, str] = {

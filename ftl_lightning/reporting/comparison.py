@@ -5,8 +5,8 @@ from itertools import zip_longest
 
 import pandas as pd
 
+from ftl_lightning.domains.comparison import CHOSEN, FINE_TUNED, OURS, PAPERS_METHOD, WITH_MODES, Compared, Published
 from ftl_lightning.domains.domain import Domain
-from ftl_lightning.domains.paper import CHOSEN, FINE_TUNED, OURS, PAPERS_METHOD, WITH_MODES, Compared, Published
 from ftl_lightning.evaluation.results import latest
 from ftl_lightning.evaluation.row import METHOD, REFERENCE, label
 from ftl_lightning.reporting.paired import Lead, leads, least_certain, same_outcome, signed
@@ -110,7 +110,7 @@ def comparison_table(domain: Domain, results: pd.DataFrame, shown: Sequence[str]
                     lines.append([setting, metric, label(*method), _verdict(tested.get(method)), *cells])
     caption = (
         f"{domain.name}: all methods{_learned_from(rows)}, mean ± standard error over tasks; ours is: by how much "
-        f"{label(*domain.ours)} is better"
+        f"{label(*domain.comparison.ours)} is better"
     )
     return make_table(domain, "comparison", caption, lines, ["setting", "metric", "method", "ours is", *BESIDE])
 
@@ -155,7 +155,7 @@ def rivals(domain: Domain, rows: pd.DataFrame, setting: str) -> list[Compared]:
 
 def _leads(domain: Domain, rows: pd.DataFrame, setting: str, metric: str) -> list[Lead]:
     method_rows = select(rows, setting=setting, metric=metric)
-    return leads(method_rows, domain.ours, rivals(domain, rows, setting), domain.less_is_better(metric))
+    return leads(method_rows, domain.comparison.ours, rivals(domain, rows, setting), domain.less_is_better(metric))
 
 
 def _verdict(lead: Lead | None) -> str:
@@ -209,7 +209,7 @@ def overview(results: pd.DataFrame) -> Table:
 def short_overview(results: pd.DataFrame) -> Table:
     """The overview in at most :data:`LINES` lines; our other forms are the chosen one and the default form of the domain."""
     domains = _domains(results)
-    defaults = {domain.ours for domain in domains}
+    defaults = {domain.comparison.ours for domain in domains}
     columns = [
         method
         for method in methods(results)
@@ -271,7 +271,7 @@ def _overview(results: pd.DataFrame, lines: Sequence[tuple[Domain, str, str]], c
         rows = rows_of[domain.name]
         lead = least_certain(_leads(domain, rows, setting, metric))
         rows = select(rows, setting=setting, metric=metric)  # rows of this line
-        form = f"{domain.ours.form}: " if domain.ours.form and lead else ""
+        form = f"{domain.comparison.ours.form}: " if domain.comparison.ours.form and lead else ""
         line = [_subject(domain, setting, metric), MISSING if lead is None else f"{form}{lead}"]
         line += [_cell(domain, rows, method, setting, metric) for method in first]
         if forms:
@@ -305,7 +305,11 @@ def _subject(domain: Domain, setting: str, metric: str) -> str:
 
 
 def _references(domain: Domain, rows: pd.DataFrame, references: pd.DataFrame, setting: str, metric: str) -> str:
-    agreeing = _agreeing(domain, of_method(select(rows, setting=setting), domain.ours)) if metric == domain.headline else {}
+    agreeing = (
+        _agreeing(domain, of_method(select(rows, setting=setting), domain.comparison.ours))
+        if metric == domain.comparison.headline
+        else {}
+    )
     return _means(select(references, setting=setting, metric=metric), agreeing)
 
 

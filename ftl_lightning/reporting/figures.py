@@ -8,8 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from ftl_lightning.domains.comparison import CHOSEN, OURS, Compared
 from ftl_lightning.domains.domain import Domain
-from ftl_lightning.domains.paper import CHOSEN, OURS, Compared
 from ftl_lightning.evaluation.diversity import FRESH, REPLAYED
 from ftl_lightning.evaluation.results import latest
 from ftl_lightning.evaluation.row import REFERENCE
@@ -150,7 +150,7 @@ def overview_dots(results: pd.DataFrame) -> Figure:
         results: see :func:`~ftl_lightning.reporting.comparison.all_methods`.
     """
     lines = shown_lines(results)
-    series = _series(methods(results), {domain.ours for domain, _, _ in lines})
+    series = _series(methods(results), {domain.comparison.ours for domain, _, _ in lines})
     colour_of = colours((label, forms[0]) for label, forms in series.items())
     panels = {domain.name: [line for line in lines if line[0].name == domain.name] for domain, _, _ in lines}
     sides: tuple[list[str], list[str]] = ([], [])

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from ftl_lightning.domains.comparison import PAPERS_METHOD
 from ftl_lightning.domains.domain import Domain
-from ftl_lightning.domains.paper import PAPERS_METHOD
 from ftl_lightning.evaluation.row import label
 from ftl_lightning.reporting.listed import read_listed
 from ftl_lightning.reporting.table import MISSING, Table, make_table, of_method, select

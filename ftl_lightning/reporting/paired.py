@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from scipy.stats import binom
 
-from ftl_lightning.domains.paper import Compared
+from ftl_lightning.domains.comparison import Compared
 from ftl_lightning.evaluation.row import label
 
 LEVEL = 0.05

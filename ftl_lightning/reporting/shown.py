@@ -6,9 +6,9 @@ from typing import NoReturn
 
 import pandas as pd
 
+from ftl_lightning.domains.comparison import OURS, PAPERS_METHOD, Compared, Comparison, Published
 from ftl_lightning.domains.domain import CLOSED, COVERAGE, EXECUTED, NOVELTY, Concepts, Domain, Metric, Plans
 from ftl_lightning.domains.from_file import OWN
-from ftl_lightning.domains.paper import OURS, PAPERS_METHOD, Compared, Published
 from ftl_lightning.domains.registry import domain_of_file, is_known
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.evaluation.judged import LOST, WON
@@ -37,7 +37,14 @@ def domain_of(name: str, rows: pd.DataFrame) -> Domain:
         measured = rows.loc[(rows["domain"] == name) & ~rows["metric"].str.startswith((CLOSED, WON, LOST)), "metric"]
         metrics = {metric: Metric(_unknown) for metric in dict.fromkeys(measured) if metric not in (NOVELTY, COVERAGE)}
         concepts = Concepts(training=(), suites={}, descriptions=(), reads=lambda text: False)
-        return Domain(name, Plans(0, (), ()), concepts, _unknown, metrics=metrics, headline=next(iter(metrics), EXECUTED))
+        return Domain(
+            name,
+            Plans(0, (), ()),
+            concepts,
+            _unknown,
+            metrics=metrics,
+            comparison=Comparison(headline=next(iter(metrics), EXECUTED)),
+        )
 
 
 def _unknown(*arguments: object) -> NoReturn:
@@ -74,13 +81,15 @@ def learned_settings(domain: Domain, rows: pd.DataFrame) -> list[str]:
 def metrics(domain: Domain) -> tuple[str, ...]:
     """Metrics of the comparison: the main metric, success and failures in closed loop, the headline, and the paper's metrics."""
     executed = [EXECUTED, *(f"{CLOSED} {outcome}" for outcome in domain.closed_loop.less_is_better)] if domain.closed_loop else []
-    names = dict.fromkeys((domain.main_metric, *executed, domain.headline, *(number.metric for number in published(domain))))
+    names = dict.fromkeys(
+        (domain.main_metric, *executed, domain.comparison.headline, *(number.metric for number in published(domain)))
+    )
     return tuple(name for name in names if name)
 
 
 def decisive(domain: Domain, rows: pd.DataFrame) -> str:
     """The metric of a small table: the domain's headline, or its main metric if the rows lack the headline."""
-    return domain.headline if domain.headline in set(rows["metric"]) else domain.main_metric
+    return domain.comparison.headline if domain.comparison.headline in set(rows["metric"]) else domain.main_metric
 
 
 def policies(domain: Domain) -> Sequence[str]:
@@ -95,17 +104,17 @@ def environments(domain: Domain) -> Sequence[str]:
 
 def published(domain: Domain) -> tuple[Published, ...]:
     """The paper's numbers, if comparable with ours; otherwise tables have no columns for the paper."""
-    return domain.paper.numbers if domain.paper and domain.paper.comparable else ()
+    return domain.comparison.paper.numbers if domain.comparison.paper and domain.comparison.paper.comparable else ()
 
 
 def main_omega(domain: Domain) -> str:
     """Guidance weight of our main tables; empty for any measured weight."""
-    return domain.paper.ours if domain.paper else ""
+    return domain.comparison.paper.ours if domain.comparison.paper else ""
 
 
 def papers_omega(domain: Domain) -> str:
     """Guidance weight of the paper's main figures; empty without a paper."""
-    return domain.paper.omega if domain.paper else ""
+    return domain.comparison.paper.omega if domain.comparison.paper else ""
 
 
 def lookup(
@@ -157,5 +166,5 @@ def headlines(domain: Domain, rows: pd.DataFrame) -> list[tuple[str, str]]:
         alone = [(setting, decisive(domain, rows[rows["setting"] == setting])) for setting in papers]
         return [headline for headline in alone if headline in measured]
     reported = [(setting, metric) for setting in measured_settings for metric in metrics(domain) if (setting, metric) in numbers]
-    executed = [(setting, domain.headline) for setting in dict.fromkeys(setting for setting, _ in reported)]
+    executed = [(setting, domain.comparison.headline) for setting in dict.fromkeys(setting for setting, _ in reported)]
     return [headline for headline in dict.fromkeys((*reported, *executed)) if headline in measured]

@@ -8,8 +8,8 @@ from typing import Any
 
 import pandas as pd
 
+from ftl_lightning.domains.comparison import OURS, PAPERS_METHOD, Compared, Published
 from ftl_lightning.domains.domain import CLOSED, EXECUTED, Domain
-from ftl_lightning.domains.paper import OURS, PAPERS_METHOD, Compared, Published
 from ftl_lightning.evaluation.judged import LOST, WON
 from ftl_lightning.evaluation.results import LARGEST_WHOLE, labels, latest
 from ftl_lightning.evaluation.row import METHOD, REFERENCE
@@ -260,7 +260,7 @@ def _paired(domain: Domain, rows: pd.DataFrame) -> Table:
             if counts is not None:
                 lines.append([setting, label, f"{name}{place}", episodes(*counts)])
                 elsewhere = "; an environment other than the domain's own is named behind the policy" if place else elsewhere
-    compared = domain.headline.removeprefix(f"{CLOSED} ")
+    compared = domain.comparison.headline.removeprefix(f"{CLOSED} ")
     caption = (
         f"{domain.name}: {compared} less that of policies from the same starts, 95 % interval, McNemar's exact p "
         f"(of these learned concepts: the episodes of a seed share one){elsewhere}"

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from ftl_lightning.domains.paper import CHOSEN, FINE_TUNED, WITH_ADAPTER, WITH_MODES
+from ftl_lightning.domains.comparison import CHOSEN, FINE_TUNED, WITH_ADAPTER, WITH_MODES
 from ftl_lightning.igm.settings import ADAPTED, AUTO, MIXED, MODES, InversionSettings
 from ftl_lightning.training.method import Method
 

@@ -8,8 +8,8 @@ from torch import Tensor
 
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import InitialStates
-from ftl_lightning.domains.beside import Drawn, beside
 from ftl_lightning.domains.domain import Domain
+from ftl_lightning.domains.pictures import Drawn, beside
 from ftl_lightning.igm.concept import Concept, QualityRecord
 from ftl_lightning.igm.forms.quality import Quality, encoded, first_windows, generated, observed_from
 from ftl_lightning.training.concept_model import ConceptModel

@@ -10,14 +10,12 @@ from torch import Tensor
 
 from ftl_lightning.domains.agent import expert
 from ftl_lightning.domains.agent import scenes as world
-from ftl_lightning.domains.agent.bodies import bowl, cone
-from ftl_lightning.domains.agent.domain import DOMAIN, act, initial_states
-from ftl_lightning.domains.agent.dynamics import MAX_FORCE, MAX_STEPS, STEP
-from ftl_lightning.domains.agent.environment import AgentEnvironment
-from ftl_lightning.domains.agent.metrics import progressed, reached
-from ftl_lightning.domains.agent.scenes import FEATURE, OBSERVED, REACH, pairs, parse, scenes, target
+from ftl_lightning.domains.agent.domain import DOMAIN, act, progressed, reached
+from ftl_lightning.domains.agent.environment import AgentEnvironment, bowl, cone
+from ftl_lightning.domains.agent.expert import initial_states
+from ftl_lightning.domains.agent.scenes import FEATURE, MAX_FORCE, MAX_STEPS, OBSERVED, REACH, STEP, pairs, parse, scenes, target
 from ftl_lightning.domains.agent.tasks import COMPOSITIONS, TRAINING_CONCEPTS
-from ftl_lightning.domains.rollout import Rollout
+from ftl_lightning.domains.execution import Rollout
 from ftl_lightning.services.errors import UserError
 
 SOURCE = DOMAIN.source(None)
@@ -176,12 +174,12 @@ def test_wrong_states_and_actions_and_a_simulator_that_does_not_start(
 @pytest.mark.parametrize("count", [5, pytest.param(50, marks=pytest.mark.slow)])
 def test_the_expert_reaches_its_target_in_99_of_100_scenes(count: int) -> None:
     tasks = ("go to red bowl", "go to purple cone", "go to bowl", "go to yellow object")
-    drives = [expert.demonstrations(task, count, 7, lambda: None) for task in tasks]
-    success = torch.cat([reached(task, episodes(seen))["success"] for task, (seen, _) in zip(tasks, drives, strict=True)])
+    drives = {task: SOURCE.draw(task, count, 7) for task in tasks}
+    success = torch.cat([reached(task, episodes(made.observed[OBSERVED]))["success"] for task, made in drives.items()])
     assert len(success) == 4 * count
     assert success.float().mean() >= 0.99
-    assert torch.cat([lengths for _, lengths in drives]).max() < expert.LENGTH
-    assert all(torch.equal(seen[0, lengths[0] - 1], seen[0, -1]) for seen, lengths in drives)
+    assert torch.cat([made.lengths for made in drives.values()]).max() < expert.LENGTH
+    assert all(torch.equal(made.states[0, made.lengths[0] - 1], made.states[0, -1]) for made in drives.values())
 
 
 def test_the_expert_drives_around_the_distractor() -> None:
@@ -200,7 +198,7 @@ def test_demonstrations_are_cached_and_repeat(monkeypatch: pytest.MonkeyPatch) -
     assert torch.equal(first.observed[OBSERVED][..., list(FEATURE.state)], first.states)
     assert first.scenes is not None
     assert torch.equal(first.scenes, first.observed[OBSERVED][:, 0])
-    monkeypatch.setattr(expert, "demonstrations", lambda *_: pytest.fail("made again"))
+    monkeypatch.setattr(expert, "_drive", lambda *_: pytest.fail("made again"))
     assert SOURCE.draw("go to red bowl", 2, 0).hash == first.hash
 
 
@@ -256,7 +254,7 @@ def test_references_stand_where_they_must() -> None:
     initial = initial_states(scenes("go to red bowl", 20, 0))
     rate = {
         name: progressed("go to red bowl", draw("go to red bowl", 20, initial, 0), initial).float().mean().item()
-        for name, draw in DOMAIN.references.items()
+        for name, draw in DOMAIN.comparison.references.items()
     }
     assert rate["expert (oracle)"] == 1.0
     assert 0.2 < rate["random object"] < 0.8

@@ -10,18 +10,17 @@ import torch
 from numpy.typing import NDArray
 
 from ftl_lightning.data.demonstrations import Demonstrations
-from ftl_lightning.domains.agent.domain import DOMAIN
+from ftl_lightning.domains.agent.domain import DOMAIN, progressed, reached
 from ftl_lightning.domains.agent.environment import AgentEnvironment
 from ftl_lightning.domains.agent.expert import LENGTH, SPEED
-from ftl_lightning.domains.agent.metrics import progressed, reached
 from ftl_lightning.domains.agent.rendering import SEEN
 from ftl_lightning.domains.agent.scenes import OBSERVED, REACH, object_positions, target
+from ftl_lightning.domains.execution import Rollout
 from ftl_lightning.domains.recorder import Scene, check_path
-from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.services.errors import UserError
 
-assert DOMAIN.recorder is not None
-RECORDER = DOMAIN.recorder
+assert DOMAIN.recordings.recorder is not None
+RECORDER = DOMAIN.recordings.recorder
 GOAL = "go to red bowl"
 
 

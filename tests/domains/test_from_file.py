@@ -10,8 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ftl_lightning.data.demonstrations import Demonstrations
+from ftl_lightning.data.distances import warped_distances
 from ftl_lightning.data.features import Feature
-from ftl_lightning.domains.from_file import METRICS, domain_from_file, own_domain, read_own, warped_distances
+from ftl_lightning.domains.from_file import METRICS, domain_from_file, own_domain, read_own
 from ftl_lightning.evaluation.evaluator import Evaluator
 from ftl_lightning.evaluation.judged import TaskResult
 from ftl_lightning.evaluation.results import read_rows
@@ -67,14 +68,14 @@ def test_a_file_is_a_domain_which_has_no_headline_without_metrics(file: str) -> 
     assert [task.goal for task in domain.concepts.suites["training"].tasks] == ["go right", "go up"]
     assert domain.concepts.reads("go up")
     assert not domain.concepts.reads("go between")
-    assert domain.main_metric == domain.headline == "end_point_within"
+    assert domain.main_metric == domain.comparison.headline == "end_point_within"
     assert [domain.less_is_better(name) for name in domain.metrics] == [False, True]
     assert domain.show.film is not None
     assert domain.observed == {}
     known = examples(go_right=walks("go right", 2), go_up=walks("go up", 2, 1))
     domain = own_domain(known, ("go right",), TIME, {})
     assert domain.metrics == {}
-    assert domain.headline == ""
+    assert domain.comparison.headline == ""
     assert domain.concepts.reads("go up")  # it can be compared with, though it is no training concept
     assert domain.concepts.training == ("go right",)
 

@@ -101,7 +101,7 @@ def test_texts_are_cleaned_and_mirrored_and_goals_may_join_several_concepts_some
 
 def test_a_frozen_frame_is_still_has_its_bones_and_is_no_action() -> None:
     starts = DOMAIN.source(None).starts("walk", 4, 0)
-    plans = DOMAIN.references["frozen frame"]("walk", 4, starts, 0)
+    plans = DOMAIN.comparison.references["frozen frame"]("walk", 4, starts, 0)
     found = DOMAIN.measure("walk", plans, starts)
     assert set(found) == set(MEASURES)
     assert not found["accuracy"].any()

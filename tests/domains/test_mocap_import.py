@@ -20,7 +20,7 @@ from tests.domains.test_mocap_reading import bvh as converted
 
 
 def imported(path: Path) -> Demonstrations:
-    return DOMAIN.imports[path.suffix](path)
+    return DOMAIN.recordings.imports[path.suffix](path)
 
 
 def exported(path: Path, states: Tensor) -> Path:

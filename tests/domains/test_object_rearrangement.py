@@ -9,8 +9,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ftl_lightning.domains.object_rearrangement import generation, relations
-from ftl_lightning.domains.object_rearrangement.relations import SHAPES, Relation, columns, holds, overlap, parse
+from ftl_lightning.domains.object_rearrangement import scenes
+from ftl_lightning.domains.object_rearrangement.scenes import SHAPES, Relation, columns, holds, overlap, parse
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.services.errors import UserError
 
@@ -25,7 +25,7 @@ def succeeded(task: str, states: torch.Tensor) -> torch.Tensor:
 
 def scene(**shapes: tuple[float, float, float]) -> torch.Tensor:
     """One state from ``shape=(x, y, radius)``."""
-    state = torch.zeros(len(SHAPES), relations.PER_SHAPE)
+    state = torch.zeros(len(SHAPES), scenes.PER_SHAPE)
     for index, shape in enumerate(SHAPES):
         state[index, :3] = torch.tensor(shapes.get(shape, (0.0, 5.0, 0.3)))
         state[index, 4 + index] = 1
@@ -51,8 +51,8 @@ def test_the_papers_numbers_of_concepts_and_tasks_and_compositions_for_tuning_th
 
 def test_the_training_set_is_the_papers_size_and_quick_and_a_task_is_independent_of_others(monkeypatch: pytest.MonkeyPatch) -> None:
     batches: list[Any] = []
-    plain = generation._propose
-    monkeypatch.setattr(generation, "_propose", lambda *arguments: batches.append(arguments) or plain(*arguments))
+    plain = scenes._propose
+    monkeypatch.setattr(scenes, "_propose", lambda *arguments: batches.append(arguments) or plain(*arguments))
     training = SOURCE.split("train", 920, 0)
     assert len(batches) == 2 * 12  # two of PROPOSALS scenes at once for each concept
     assert training.states.shape == (11_040, 1, 21)
@@ -67,7 +67,7 @@ def test_the_training_set_is_the_papers_size_and_quick_and_a_task_is_independent
 @pytest.fixture
 def few(monkeypatch: pytest.MonkeyPatch) -> None:
     """An eighth of the scenes proposed at a time."""
-    monkeypatch.setattr(generation, "PROPOSALS", generation.PROPOSALS // 8)
+    monkeypatch.setattr(scenes, "PROPOSALS", scenes.PROPOSALS // 8)
 
 
 @pytest.mark.usefixtures("few")
@@ -85,7 +85,7 @@ def test_generated_scenes_show_the_task_and_nothing_else(task: str) -> None:
     for relation in named:
         assert holds(relation, flat, relaxed=False).all()
     about = {frozenset(relation.shapes) for relation in named if relation.kind in ("diagonal to", "antidiagonal to", "next to")}
-    for relation in relations.TRAINING_RELATIONS:
+    for relation in scenes.TRAINING_RELATIONS:
         if relation not in named and frozenset(relation.shapes) not in about:
             assert not holds(relation, flat, relaxed=False).any()
 
@@ -129,7 +129,7 @@ def test_a_negated_relation_is_read_written_and_holds_where_the_relation_does_no
     assert (above.negated, diagonal.negated, ring.negated) == (False, True, True)
     assert ring == Relation("ring", SHAPES, 2.0, negated=True)
     assert " and ".join(map(str, (above, diagonal, ring))) == task
-    assert relations.sentence(task).split(" and not ")[1] == "square right and above diagonally to triangle"
+    assert scenes.sentence(task).split(" and not ")[1] == "square right and above diagonally to triangle"
     for dx in (0.5, 0.9, 1.1):  # 0.5: exact; 0.9: only relaxed; 1.1: not even that
         state = scene(circle=(2 + dx, 4, 0.5), square=(2, 1, 0.3))
         for relaxed in (False, True):
@@ -159,7 +159,7 @@ def test_a_ring_can_be_laid_onto_either_diagonal() -> None:
 @settings(max_examples=15, deadline=None)
 @given(st.integers(0, 2**31))
 def test_relaxed_contains_exact_and_right_of_excludes_its_reverse(seed: int) -> None:
-    states = DOMAIN.references["random scenes"]("", 200, None, seed)[:, 0]
+    states = DOMAIN.comparison.references["random scenes"]("", 200, None, seed)[:, 0]
     for kind, pair in itertools.product(("right of", "above", "next to"), itertools.permutations(SHAPES, 2)):
         relation, reverse = Relation(kind, pair), Relation(kind, pair[::-1])
         exact = holds(relation, states, relaxed=False)
@@ -174,7 +174,7 @@ def test_the_circumradius_is_that_of_the_circle_points_were_put_on(
     radius: float, x: float, y: float, turn: float, gap: float
 ) -> None:
     angle = torch.tensor([turn, turn + gap, turn + 3.1 * gap])
-    found = relations.circumradius((x + radius * angle.cos())[None], (y + radius * angle.sin())[None])
+    found = scenes.circumradius((x + radius * angle.cos())[None], (y + radius * angle.sin())[None])
     assert found.item() == pytest.approx(radius, rel=1e-3)
 
 
@@ -191,5 +191,5 @@ def test_contradicting_relations_and_an_unreadable_task_are_clear_errors() -> No
 @pytest.mark.usefixtures("few")
 def test_the_oracle_is_right_and_chance_is_not() -> None:
     for task in TASKS[::7]:
-        assert succeeded(task, DOMAIN.references["generator (oracle)"](task, 20, None, 0)).all()
-        assert succeeded(task, DOMAIN.references["random scenes"](task, 500, None, 0)).float().mean() < 0.5
+        assert succeeded(task, DOMAIN.comparison.references["generator (oracle)"](task, 20, None, 0)).all()
+        assert succeeded(task, DOMAIN.comparison.references["random scenes"](task, 500, None, 0)).float().mean() < 0.5

@@ -14,15 +14,14 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.data.demonstrations import Demonstrations
-from ftl_lightning.domains.domain import Concepts, Domain, Plans
-from ftl_lightning.domains.generated import Generated
+from ftl_lightning.domains.domain import Concepts, Domain, Generated, Plans
 from ftl_lightning.domains.registry import domain_names, load_domain, recorded_name
 from ftl_lightning.domains.tasks import few_shot_suites
 from ftl_lightning.evaluation.closed_loop import PlanFollower, fixed_plans, roll_out
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.training.data import InversionData, PretrainingData
 from tests.conftest import ROOT, Once, python, refused, succeed
-from tests.domains.test_registry import offering
+from tests.domains.test_domain import offering
 
 EXAMPLES = ROOT / "examples"
 EXAMPLE = EXAMPLES / "ftl-strokes"
@@ -132,7 +131,7 @@ def test_the_expert_s_pushes_are_right_in_open_and_closed_loop_and_a_random_targ
         starts = drawn.initial_states
         assert torch.equal(starts.observed["world"], starts.require_scenes())
         assert measure(task, drawn.states, starts).all()
-        assert measure(task, pushes.references["random target"](task, 40, starts, 0), starts).float().mean() < 0.8
+        assert measure(task, pushes.comparison.references["random target"](task, 40, starts, 0), starts).float().mean() < 0.8
         rollout = roll_out(loop, starts, PlanFollower(fixed_plans(drawn.states), loop.act, loop.steps))
         assert loop.judge(task, rollout)["success"].all()
         assert len(loop.film(rollout.take(0, 1), drawn.states[:1])) > 1

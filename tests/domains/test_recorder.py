@@ -9,17 +9,16 @@ import torch
 
 from ftl_lightning.apps.testing.strokes import recognised, strokes
 from ftl_lightning.data.demonstrations import Demonstrations
+from ftl_lightning.domains.films import VectorFilm, still
 from ftl_lightning.domains.from_file import own_domain
-from ftl_lightning.domains.hand_line import at_even_steps, reached, smoothed
-from ftl_lightning.domains.object_rearrangement.relations import EXTENT, TRAINING_RELATIONS, holds, overlap
-from ftl_lightning.domains.recorder import AROUND, MOST_STEPS, Recorder, Scene, check_path
+from ftl_lightning.domains.object_rearrangement.scenes import EXTENT, TRAINING_RELATIONS, holds, overlap
+from ftl_lightning.domains.recorder import AROUND, MOST_STEPS, Recorder, Scene, at_even_steps, check_path, reached, smoothed
 from ftl_lightning.domains.registry import load_domain
-from ftl_lightning.domains.vector_film import VectorFilm, still
 from ftl_lightning.services.errors import LONGEST, UserError
 
 SHAPES = load_domain("object_rearrangement")
-assert SHAPES.recorder is not None
-ARRANGED = SHAPES.recorder
+assert SHAPES.recordings.recorder is not None
+ARRANGED = SHAPES.recordings.recorder
 EMPTY = Scene(VectorFilm((still("line", [(0, 0), (1, 1)], "#000000"),), (0.0, 0.0, 10.0, 10.0), 1.0))
 
 
@@ -30,7 +29,7 @@ def examples(horizon: int = 40, columns: int = 2) -> Demonstrations:
 
 
 def drawn(horizon: int = 40) -> Recorder:
-    found = own_domain(examples(horizon), ("heart",), horizon, {}).recorder
+    found = own_domain(examples(horizon), ("heart",), horizon, {}).recordings.recorder
     assert found is not None
     return found
 
@@ -124,7 +123,7 @@ def test_lines_are_drawn_within_a_square_around_the_examples_and_slips_and_other
             shown(recorder, [[[x, y]], [[x + length * width, y]]])
     assert shown(recorder, [[[x, y]], [[x + 0.03 * width, y]]]).states.shape == (1, 40, 2)
     for horizon, columns in ((1, 2), (40, 4)):
-        assert own_domain(examples(horizon, columns), ("heart",), horizon, {}).recorder is None
+        assert own_domain(examples(horizon, columns), ("heart",), horizon, {}).recordings.recorder is None
 
 
 def test_shapes_are_put_where_they_belong_and_judged_as_any_scene() -> None:

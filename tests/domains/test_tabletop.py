@@ -11,7 +11,7 @@ import torch
 
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import InitialStates
-from ftl_lightning.domains.rollout import Rollout
+from ftl_lightning.domains.execution import Rollout
 from ftl_lightning.domains.tabletop import DOMAIN, WIDE, experts, source, tasks
 from ftl_lightning.domains.tabletop import scenes as layout
 from ftl_lightning.domains.tabletop.domain import act

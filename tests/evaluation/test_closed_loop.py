@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ftl_lightning.data.features import Feature, InitialStates, Observed
 from ftl_lightning.data.normalization import Normalization
-from ftl_lightning.domains.domain import ClosedLoop
+from ftl_lightning.domains.execution import ClosedLoop
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.evaluation import closed_loop
 from ftl_lightning.evaluation.closed_loop import PlanFollower, fixed_plans, reset, roll_out, sampled_plans

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.data.demonstrations import Demonstrations
-from ftl_lightning.data.distances import path_distance, scaled_distance
+from ftl_lightning.data.distances import path_distance, scaled_distance, warped_distances
 from ftl_lightning.domains.domain import Domain
-from ftl_lightning.domains.from_file import own_domain, warped_distances
+from ftl_lightning.domains.from_file import own_domain
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.evaluation.diversity import FRESH, REPLAYED, Real, coverage, lines, novelty
@@ -67,7 +67,7 @@ def test_replayed_demonstrations_have_novelty_0_and_fresh_samples_are_none_nor_t
 
 def test_more_plans_never_increase_the_distance_of_coverage() -> None:
     real = Real.of(TASK, SCENES, 40, five())
-    plans = SCENES.references["random scenes"](NEW, 40, None, 0)
+    plans = SCENES.comparison.references["random scenes"](NEW, 40, None, 0)
     found = [real.values(plans[:count])["coverage"] for count in range(1, 41)]
     assert found == sorted(found, reverse=True)
     assert found[-1] < found[0]
@@ -75,7 +75,7 @@ def test_more_plans_never_increase_the_distance_of_coverage() -> None:
 
 def test_wider_plans_do_not_seem_nearer_for_it() -> None:
     """Scales are those of real behaviour, so that noise has its full distance."""
-    real = Real.of(TASK, replace(SCENES, distance=None), 10, five())
+    real = Real.of(TASK, replace(SCENES, comparison=replace(SCENES.comparison, distance=None)), 10, five())
     values = [real.values(five().states * width)["novelty"] for width in (2, 20)]
     assert values[1] > 5 * values[0] > 0
 
@@ -140,7 +140,7 @@ def test_scenes_differ_by_their_shapes_centres_alone() -> None:
     turned[..., 2:7] += 0.1  # radius, angle and type of the circle
     moved[..., 7] += 3  # x of the triangle
     moved[..., 8] += 4
-    assert SCENES.distance(scene, torch.cat((turned, moved))).tolist() == [[0, pytest.approx(5)]]
+    assert SCENES.comparison.distance(scene, torch.cat((turned, moved))).tolist() == [[0, pytest.approx(5)]]
 
 
 def test_paths_of_navigation_are_seen_from_their_start() -> None:
@@ -150,7 +150,7 @@ def test_paths_of_navigation_are_seen_from_their_start() -> None:
     elsewhere[..., [0, 2]] += 1  # x and z
     faster[..., 3:] += 1
     longer[:, 1:, 0] += 1
-    found = agent.distance(path, torch.cat((elsewhere, faster, longer)))[0].tolist()
+    found = agent.comparison.distance(path, torch.cat((elsewhere, faster, longer)))[0].tolist()
     assert found == pytest.approx([0, 0, (127 / 128) ** 0.5], abs=1e-5)
 
 
@@ -160,10 +160,10 @@ def test_paths_of_driving_are_seen_from_their_start_and_heading() -> None:
     ahead = 5 * torch.arange(8.0)
     north[..., 1], north[..., 5] = ahead + 3, 1.0  # along x with cosine 1
     east[..., 2], east[..., 6] = ahead - 7, 1.0  # along y with sine 1
-    assert driving.distance(north, torch.cat((east, north.roll(1, 0)))).tolist()[0] == pytest.approx([0, 0], abs=1e-5)
+    assert driving.comparison.distance(north, torch.cat((east, north.roll(1, 0)))).tolist()[0] == pytest.approx([0, 0], abs=1e-5)
     slower = north.clone()
     slower[:, -1, 1] -= 8
-    assert driving.distance(north, slower).item() == pytest.approx((64 / 8) ** 0.5)
+    assert driving.comparison.distance(north, slower).item() == pytest.approx((64 / 8) ** 0.5)
 
 
 def test_own_behaviour_is_compared_by_time_warping_and_has_no_fresh_samples() -> None:
@@ -182,8 +182,8 @@ def test_own_behaviour_is_compared_by_time_warping_and_has_no_fresh_samples() ->
     assert FRESH not in real.lines()
     scale, whole = states.flatten(0, 1).std(dim=0), torch.full((3,), 12)
     expected = warped_distances(states / scale, whole, states / scale, whole)
-    assert torch.allclose(domain.distance(states, states), expected)
-    assert torch.allclose(domain.distance(states, states[:1]), expected[:, :1])
+    assert torch.allclose(domain.comparison.distance(states, states), expected)
+    assert torch.allclose(domain.comparison.distance(states, states[:1]), expected[:, :1])
 
 
 @pytest.mark.slow

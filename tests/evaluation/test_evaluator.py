@@ -17,6 +17,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensorboard.plugins.hparams.metadata import parse_session_start_info_plugin_data
 
 from ftl_lightning.data.demonstrations import Demonstrations
+from ftl_lightning.domains.comparison import Comparison
 from ftl_lightning.domains.domain import Domain, Metric
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.domains.tasks import EvaluationTask
@@ -84,7 +85,7 @@ def test_a_metric_may_be_a_number_of_each_sample_or_of_the_whole_set_and_less_ma
 
     spread = Metric(lambda goal, states, starts: states.std(dim=0).mean(), identity="judge 1")
     metrics = {"spread": spread, "distance": Metric(distance, less_is_better=True), "accuracy": base.metrics["accuracy"]}
-    domain = replace(base, metrics=metrics, headline="distance")
+    domain = replace(base, metrics=metrics, comparison=Comparison(headline="distance"))
     task = base.concepts.suites["training"].tasks[0]
     states = base.source(None).draw(task.goal, 4, 0).states
     one = TaskResult.of(task, states, None, domain)

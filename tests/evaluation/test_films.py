@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.driving.shipped import SHIPPED
+from ftl_lightning.domains.films import Shape, VectorFilm, Wireframe, still
 from ftl_lightning.domains.registry import domain_names, load_domain
-from ftl_lightning.domains.vector_film import Shape, VectorFilm, still
-from ftl_lightning.domains.wireframe import Wireframe
 from ftl_lightning.evaluation.closed_loop import PlanFollower, fixed_plans, roll_out
 from ftl_lightning.evaluation.films import ABSENT, STEPS, packed, packed_space
 from ftl_lightning.evaluation.results import read_rows
@@ -55,7 +54,7 @@ def test_an_evaluation_writes_films_of_its_rows(evaluated: Path, log: Path) -> N
 def test_the_agent_of_a_film_goes_where_it_went() -> None:
     domain = load_domain("agent")
     starts = domain.source(None).starts("go to red bowl", 1, 0)
-    plans = domain.references["expert (oracle)"]("go to red bowl", 1, starts, 0)
+    plans = domain.comparison.references["expert (oracle)"]("go to red bowl", 1, starts, 0)
     rollout = roll_out(domain.closed_loop, starts, PlanFollower(fixed_plans(plans), domain.closed_loop.act, 200))
     film = domain.closed_loop.vector_film(rollout)
     way = next(shape for shape in film.shapes if shape.kind == "way")
@@ -88,10 +87,10 @@ def test_roads_stay_and_the_controlled_vehicle_drives() -> None:
 
 @pytest.mark.parametrize("columns", [2, 4])
 def test_own_behaviour_is_filmed_by_its_columns(columns: int) -> None:
-    from ftl_lightning.domains.domain import Plans, line_drawings
+    from ftl_lightning.domains.pictures import line_drawings
 
     names = tuple(f"c{number}" for number in range(columns))
-    show = line_drawings(Plans(12, names, ("m",) * columns))
+    show = line_drawings(names)
     film = show.vector_film(torch.randn(12, columns, generator=torch.Generator().manual_seed(0)), None)
     left, lower, width, height = film.window
     for shape in film.shapes:
@@ -134,7 +133,7 @@ def middle(film: VectorFilm) -> NDArray[np.float32]:
 def test_a_plan_of_the_agent_is_a_way_in_its_scene(length: int) -> None:
     domain = load_domain("agent")
     starts = domain.source(None).starts("go to red bowl", 1, 0)
-    states = domain.references["nearest object"]("go to red bowl", 1, starts, 0)[0, :length]
+    states = domain.comparison.references["nearest object"]("go to red bowl", 1, starts, 0)[0, :length]
     film = domain.show.vector_film(states, starts)
     assert film.frames == length
     assert np.allclose(middle(film), states[:, [0, 2]].numpy(), atol=1e-5)

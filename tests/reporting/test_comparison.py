@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from ftl_lightning.cli.main import main
-from ftl_lightning.domains.paper import Compared
+from ftl_lightning.domains.comparison import Compared
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.evaluation.results import append_rows, read_rows, read_study
 from ftl_lightning.evaluation.row import Row
@@ -185,7 +185,7 @@ def test_a_form_of_ours_is_no_baseline_and_others_are_compared_with_the_domains_
     line = overview(rows).cells.iloc[0]
     assert line["other forms"] == "with modes 1.00 ± 0.00"  # the paper has no number of it
     assert line["lead"] == "+0.30 against BC, undecided (2 pairs)"
-    by_modes = replace(DOMAIN, ours=Compared("FTL-IGM", "with modes"))
+    by_modes = replace(DOMAIN, comparison=replace(DOMAIN.comparison, ours=Compared("FTL-IGM", "with modes")))
     told = comparison_table(by_modes, rows).cells.set_index("method")["ours is"]
     assert told[["FTL-IGM", "FTL-IGM with modes", "BC"]].tolist() == ["-", "-", "+0.50, undecided (2 pairs)"]
 

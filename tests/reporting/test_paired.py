@@ -1,7 +1,7 @@
 import pandas as pd
 import pytest
 
-from ftl_lightning.domains.paper import Compared
+from ftl_lightning.domains.comparison import Compared
 from ftl_lightning.reporting.paired import Lead, episodes, holm, leads, least_certain, sign_flip
 
 

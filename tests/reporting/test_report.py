@@ -150,7 +150,7 @@ def test_settings_of_ones_own_come_last_and_components_apart(tmp_path: Path) -> 
 
 def test_a_domain_without_a_paper_and_its_suites_has_tables_without_the_papers_columns(tmp_path: Path) -> None:
     concepts = replace(DOMAIN.concepts, suites={"mine": DOMAIN.concepts.suites["validation"]})
-    alone = replace(DOMAIN, paper=None, concepts=concepts)
+    alone = replace(DOMAIN, comparison=replace(DOMAIN.comparison, paper=None), concepts=concepts)
     rows = [row(setting, task, 0.5, K=K) for setting in ("mine", "new concept") for task in "ab" for K in (1, 2)]
     rows += [row("mine", "a", 0.1, method="random scenes", **REFERENCE)]
     append_rows(tmp_path / "r.csv", rows)
@@ -166,7 +166,7 @@ def test_a_domain_without_a_paper_and_its_suites_has_tables_without_the_papers_c
 
 def test_every_published_number_belongs_to_a_task_or_setting() -> None:
     tasks = {(task.setting, task.name) for suite in DOMAIN.concepts.suites.values() for task in suite.tasks}
-    for published in DOMAIN.paper.numbers:
+    for published in DOMAIN.comparison.paper.numbers:
         assert published.setting in {setting for setting, _ in tasks}
         assert not published.task or (published.setting, published.task) in tasks
         assert 0 <= published.value <= 1

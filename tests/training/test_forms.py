@@ -9,8 +9,7 @@ from matplotlib.colors import to_hex
 
 from ftl_lightning.apps.testing.strokes import strokes
 from ftl_lightning.data.demonstrations import Demonstrations, concatenate
-from ftl_lightning.domains.object_rearrangement.generation import random_scenes
-from ftl_lightning.domains.object_rearrangement.relations import columns
+from ftl_lightning.domains.object_rearrangement.scenes import columns, random_scenes
 from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import Concept
@@ -195,9 +194,11 @@ def test_the_quality_of_what_was_learned_is_told_and_drawn(model: FewShot) -> No
 
 
 def test_own_data_is_drawn_with_its_demonstrations_above_on_one_scale() -> None:
-    from ftl_lightning.domains.line_plots import PLAIN, RIGHT, WRONG, beside
+    from ftl_lightning.domains.pictures import PLAIN, RIGHT, WRONG, line_drawings
 
-    figure = beside(("x", "y"))(torch.zeros(2, 9, 2), torch.full((9, 9, 2), 3.0), "a title", [True] * 8 + [False])
+    beside = line_drawings(("x", "y")).beside
+    assert beside is not None
+    figure = beside(torch.zeros(2, 9, 2), torch.full((9, 9, 2), 3.0), "a title", [True] * 8 + [False])
     drawn = [axes for axes in figure.axes if axes.lines]
     assert len(drawn) == 11
     assert len({axes.get_xlim() for axes in drawn}) == 1

@@ -15,8 +15,8 @@ from torch import Tensor
 from ftl_lightning.apps.testing import more_strokes
 from ftl_lightning.apps.testing.families import beats, pictures, reaches
 from ftl_lightning.data.features import InitialStates
-from ftl_lightning.domains.domain import ACCURACY, Concepts, Domain, Metric, Plans
-from ftl_lightning.domains.generated import Generated
+from ftl_lightning.domains.comparison import Comparison
+from ftl_lightning.domains.domain import ACCURACY, Concepts, Domain, Generated, Metric, Plans
 from ftl_lightning.domains.tasks import EvaluationTask, Suite, training_suite
 from ftl_lightning.services.seeding import FRESH_SEED
 
@@ -110,7 +110,7 @@ def family(name: str, plans: Plans, draw: Draw, kinds: tuple[Sequence[str], Sequ
         concepts=Concepts(training, {"training": training_suite(training), "validation": new(validation), "paper": new(test)}),
         source=lambda root: source,
         metrics={ACCURACY: Metric(right)},
-        references={CHANCE: chance, ORACLE: oracle},
+        comparison=Comparison(references={CHANCE: chance, ORACLE: oracle}),
     )
 
 

@@ -64,7 +64,7 @@ class Demonstrating:
     @property
     def files(self) -> tuple[str, ...]:
         """Suffixes of readable files."""
-        return (*FILES, *self._domain.imports)
+        return (*FILES, *self._domain.recordings.imports)
 
     def told(self) -> dict[str, Any]:
         """Films, findings of the check for each demonstration and for all, and whether a change can be undone."""
@@ -95,7 +95,7 @@ class Demonstrating:
         return replace(joined, concepts=(name,) * len(joined))
 
     def _recorder(self) -> Recorder:
-        if (recorder := self._domain.recorder) is None:
+        if (recorder := self._domain.recordings.recorder) is None:
             raise UserError(f"scene: expected a model whose behaviour is shown by hand, found one of {self._domain.name}")
         return recorder
 
@@ -154,7 +154,7 @@ class Demonstrating:
             path = Path(folder) / f"file{ending}"
             path.write_bytes(content)
             try:
-                imports = self._domain.imports.get(ending)
+                imports = self._domain.recordings.imports.get(ending)
                 self.add(self._model.demonstrations((imports or Demonstrations.load)(path), name=stem))
             except UserError as error:  # names a file that the user does not know
                 message = str(error).replace(str(path), short(Path(name).name))

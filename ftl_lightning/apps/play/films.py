@@ -8,10 +8,10 @@ from torch import Tensor
 
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import InitialStates
-from ftl_lightning.domains.domain import SUCCESS, Domain, Show
-from ftl_lightning.domains.line_plots import line_film
-from ftl_lightning.domains.rollout import Rollout
-from ftl_lightning.domains.vector_film import VectorFilm
+from ftl_lightning.domains.domain import SUCCESS, Domain
+from ftl_lightning.domains.execution import Rollout
+from ftl_lightning.domains.films import VectorFilm
+from ftl_lightning.domains.pictures import Show, line_film
 from ftl_lightning.evaluation.films import packed, packed_space
 
 Json = dict[str, Any]

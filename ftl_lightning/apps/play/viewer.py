@@ -8,8 +8,9 @@ from ftl_lightning.apps.play.films import Json, plan_film
 from ftl_lightning.apps.play.mixing import sampling_of, starts_of
 from ftl_lightning.data.check import check, read_mended
 from ftl_lightning.data.demonstrations import Demonstrations
-from ftl_lightning.domains.domain import Domain, Plans, Show, line_drawings
+from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.from_file import OWN, read_own
+from ftl_lightning.domains.pictures import Show, line_drawings
 from ftl_lightning.domains.registry import domain_names, load_domain
 from ftl_lightning.igm.concept import KIND, Concept
 from ftl_lightning.services.errors import UserError, about
@@ -73,7 +74,7 @@ def _of_demonstrations(file: str) -> tuple[list[str], list[Json]]:
     domain = _domain_of(data)
     with about(file):
         data = data.fitted(domain.observed) if domain is not None else data
-    show = line_drawings(Plans(data.states.shape[1], data.state_names, data.state_units)) if domain is None else domain.show
+    show = line_drawings(data.state_names) if domain is None else domain.show
     names = list(dict.fromkeys(data.concepts))
     notes = [str(data)]
     if len(names) > MOST_CONCEPTS:

@@ -103,7 +103,7 @@ class Workspace:
 
     def state(self) -> dict[str, Any]:
         """Initial state of the page."""
-        domain, recorder = self._domain, self._domain.recorder
+        domain, recorder = self._domain, self._domain.recordings.recorder
         return {
             "title": self.name.rpartition("/")[2].replace("_", " "),
             "model": {"name": self.name, "title": domain.name.replace("_", " "), "hash": self._model.model.hash},

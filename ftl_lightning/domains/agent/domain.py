@@ -1,87 +1,38 @@
-"""Domain object of navigation."""
+"""Domain object of navigation, with its metrics, view and reference policies."""
 
-from collections.abc import Callable, Mapping
+import itertools
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.distances import path_distance
 from ftl_lightning.data.features import InitialStates, Observed, check_starts
-from ftl_lightning.data.formats.files import cached
-from ftl_lightning.domains.agent import dynamics, expert
-from ftl_lightning.domains.agent import scenes as scene_settings
-from ftl_lightning.domains.agent.dynamics import LOOKAHEAD, MAX_STEPS, check_simulator
-from ftl_lightning.domains.agent.metrics import progressed, reached
-from ftl_lightning.domains.agent.published import PUBLISHED
-from ftl_lightning.domains.agent.scenes import FEATURE, OBSERVED, PLANE, STATE, object_positions, parse, scenes, target
-from ftl_lightning.domains.agent.tasks import SUITES, TRAINING_CONCEPTS
-from ftl_lightning.domains.agent.views import VIEWS
-from ftl_lightning.domains.deferred import deferred
-from ftl_lightning.domains.domain import ACCURACY, ClosedLoop, Concepts, Domain, Metric, Plans, Show, Split
-from ftl_lightning.domains.paper import Paper
+from ftl_lightning.domains.agent.expert import NAME, SPEED, STATE_NAMES, STATE_UNITS, Expert, demonstrate, environment
+from ftl_lightning.domains.agent.scenes import (
+    FEATURE,
+    LOOKAHEAD,
+    MAX_STEPS,
+    OBSERVED,
+    PLANE,
+    REACH,
+    STATE,
+    STEP,
+    check_simulator,
+    object_positions,
+    parse,
+    target,
+)
+from ftl_lightning.domains.agent.tasks import PUBLISHED, SUITES, TRAINING_CONCEPTS
+from ftl_lightning.domains.comparison import Comparison, Paper
+from ftl_lightning.domains.domain import ACCURACY, Concepts, Domain, Metric, Plans, Recordings, View, deferred
+from ftl_lightning.domains.execution import ClosedLoop, Rollout
+from ftl_lightning.domains.pictures import Show
 from ftl_lightning.domains.recorder import Recorder
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.seeding import VALIDATION_SEED
 
-if TYPE_CHECKING:
-    from ftl_lightning.domains.agent.environment import AgentEnvironment
-
-NAME = "agent"
 HORIZON = 128
 RENDERING, STEERING = "ftl_lightning.domains.agent.rendering", "ftl_lightning.domains.agent.steering"
-STATE_NAMES = tuple(
-    f"agent.{column}"
-    for column in ("x", "y", "z", "qx", "qy", "qz", "qw", "vx", "vy", "vz", "angular vx", "angular vy", "angular vz")
-)
-STATE_UNITS = ("m",) * 3 + ("1",) * 4 + ("m/s",) * 3 + ("rad/s",) * 3
-_SETTINGS = {
-    name: getattr(module, name)
-    for module, names in (
-        (dynamics, ("STEP", "SUBSTEPS", "DRAG", "MASS", "MAX_FORCE", "RADIUS", "LOOKAHEAD", "MARGIN")),
-        (scene_settings, ("AGENT_START", "OBJECT_X", "OBJECT_Z", "AGENT_CLEARANCE", "OBJECT_CLEARANCE", "COLOURS", "SHAPES")),
-        (expert, ("LENGTH", "SPEED", "KEEP_CLEAR", "STOP", "AT_REST")),
-    )
-    for name in names
-}
-"""Settings that determine demonstrations besides task, count and seed (cache key)."""
-
-
-def demonstrations(tasks: tuple[str, ...], count: int, seed: int) -> Demonstrations:
-    """``count`` expert drives of each task, from the cache if present."""
-    return cached(
-        {"domain": NAME, "tasks": tasks, "count": count, "seed": seed, **_SETTINGS},
-        len(tasks) * count,
-        lambda progress: _drive(tasks, count, seed, progress),
-    )
-
-
-def _drive(tasks: tuple[str, ...], count: int, seed: int, progress: Callable[[], None]) -> Demonstrations:
-    parts = [expert.demonstrations(task, count, seed, progress) for task in tasks]
-    return drives(
-        torch.cat([seen for seen, _ in parts]),
-        torch.cat([lengths for _, lengths in parts]),
-        tuple(task for task in tasks for _ in range(count)),
-        {"generator": NAME, "seed": seed, "count_per_task": count},
-    )
-
-
-def drives(observations: Tensor, lengths: Tensor, concepts: tuple[str, ...], provenance: Mapping[str, Any]) -> Demonstrations:
-    """Convert drives ``(demo, time, 52)`` to demonstrations."""
-    return Demonstrations(
-        states=observations[..., :STATE].contiguous(),
-        lengths=lengths,
-        domain=NAME,
-        state_names=STATE_NAMES,
-        state_units=STATE_UNITS,
-        concepts=concepts,
-        observed={OBSERVED: observations},
-        per_step=(OBSERVED,),
-        scenes=observations[:, 0].contiguous(),
-        provenance=provenance,
-    )
 
 
 def reads(task: str) -> bool:
@@ -92,34 +43,65 @@ def reads(task: str) -> bool:
         return False
 
 
-class Expert:
-    """Source of expert drives, cached."""
+def _to_each(goal: str, positions: Tensor, world: Tensor) -> tuple[Tensor, Tensor]:
+    """Distances in metres ``(scene, time)`` to the target and to the distractor.
 
-    def split(self, name: Split, count: int, seed: int) -> Demonstrations:
-        return demonstrations(TRAINING_CONCEPTS, count, seed if name == "train" else VALIDATION_SEED + seed)
-
-    def draw(self, task: str, count: int, seed: int, workers: int = 1) -> Demonstrations:
-        return demonstrations((task,), count, seed)
-
-    def starts(self, task: str, count: int, seed: int) -> InitialStates:
-        return initial_states(scenes(task, count, seed))
-
-
-def initial_states(drawn: Tensor) -> InitialStates:
-    """Initial states of scenes ``(scene, 52)``, which are fully observed."""
-    return InitialStates({OBSERVED: drawn}, drawn)
-
-
-def environment() -> "AgentEnvironment":
-    """Environment of the domain.
-
-    Raises:
-        UserError: without the simulator, or if it does not start.
+    Args:
+        goal: the task in words.
+        positions: agent's positions ``(scene, time, 3)``.
+        world: ``(scene, 52)``.
     """
-    check_simulator()
-    from ftl_lightning.domains.agent.environment import AgentEnvironment
+    both = torch.linalg.vector_norm(positions[:, :, None] - object_positions(world)[:, None], dim=-1)
+    chosen = target(goal, world)[:, None, None].expand(-1, both.shape[1], 1)
+    return both.gather(-1, chosen)[..., 0], both.gather(-1, 1 - chosen)[..., 0]
 
-    return AgentEnvironment()
+
+def progressed(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
+    """Whether a plan ends nearer to the target than it starts (paper, open loop).
+
+    Args:
+        goal: the task in words.
+        states: plans ``(scene, horizon, 13)``.
+        starts: initial states with ``world (scene, 52)``.
+
+    Returns:
+        ``(scene,)`` of bool; false where a plan is not finite.
+    """
+    world = check_starts(starts).observed[OBSERVED]
+    to_target, _ = _to_each(goal, torch.cat((world[:, None, :3], states[:, -1:, :3]), dim=1), world)
+    return to_target[:, -1] < to_target[:, 0]
+
+
+def reached(goal: str, rollout: Rollout) -> dict[str, Tensor]:
+    """Outcomes of episodes (paper, closed loop).
+
+    Args:
+        goal: the task in words.
+        rollout: episodes with ``world (episode, time, 52)``, padded with the last.
+
+    Returns:
+        ``(episode,)`` of bool each: ``success``, the agent ends within :data:`REACH` of the target and never was within
+        :data:`REACH` of the distractor; ``distractor``, it was; ``progress``, it ends nearer to the target.
+    """
+    world = rollout.observed[OBSERVED]
+    to_target, to_distractor = _to_each(goal, world[..., :3], world[:, 0])
+    touched = (to_distractor < REACH).any(dim=1)
+    return {
+        "success": (to_target[:, -1] < REACH) & ~touched,
+        "distractor": touched,
+        "progress": to_target[:, -1] < to_target[:, 0],
+    }
+
+
+def _encode_steps(states: Tensor, observed: Observed) -> Tensor:
+    """Difference of each state ``(sample, horizon, 13)`` from the preceding state; the first from the present."""
+    return torch.diff(states, dim=1, prepend=observed[OBSERVED][:, None, :STATE])
+
+
+def _decode_steps(steps: Tensor, observed: Observed) -> Tensor:
+    """Inverse of :func:`_encode_steps`."""
+    # Not cumsum, which has no deterministic form on GPUs.
+    return torch.stack(list(itertools.accumulate(steps.unbind(dim=1), initial=observed[OBSERVED][:, :STATE]))[1:], dim=1)
 
 
 def act(plans: Tensor, step: int, observed: Observed) -> Tensor:
@@ -141,7 +123,7 @@ def _straight(world: Tensor, chosen: Tensor) -> Tensor:
     start = world[:, None, :3]
     way = (goal - world[:, :3])[:, None]
     length = torch.linalg.vector_norm(way, dim=-1, keepdim=True)
-    driven = torch.minimum(torch.arange(HORIZON)[None, :, None] * dynamics.STEP * expert.SPEED, length)
+    driven = torch.minimum(torch.arange(HORIZON)[None, :, None] * STEP * SPEED, length)
     plans = world[:, None, :STATE].repeat(1, HORIZON, 1)
     plans[..., :3] = start + way * driven / length
     return plans
@@ -162,7 +144,7 @@ def _random(goal: str, count: int, starts: InitialStates | None, seed: int) -> T
 def _oracle(goal: str, count: int, starts: InitialStates | None, seed: int) -> Tensor:
     env, world = environment(), check_starts(starts).observed[OBSERVED]
     drives = [
-        torch.from_numpy(expert.demonstrate(env, state, chosen))
+        torch.from_numpy(demonstrate(env, state, chosen))
         for state, chosen in zip(world.numpy(), target(goal, world).tolist(), strict=True)
     ]
     env.close()
@@ -196,10 +178,11 @@ DOMAIN = Domain(
     source=lambda root: Expert(),
     observed={OBSERVED: FEATURE},
     metrics={ACCURACY: Metric(progressed)},
-    headline="closed loop success",
     show=Show(deferred(f"{RENDERING}:render"), vector_film=deferred(f"{RENDERING}:plan_film")),
-    references={"nearest object": _nearest, "random object": _random, "expert (oracle)": _oracle},
-    views=VIEWS,
+    views={
+        # Autoregressive methods need not copy the state, which changes by about 1% per step.
+        "steps": View({OBSERVED: FEATURE}, observe=lambda observed: observed, encode=_encode_steps, decode=_decode_steps)
+    },
     closed_loop=ClosedLoop(
         environment=environment,
         act=act,
@@ -209,13 +192,19 @@ DOMAIN = Domain(
         vector_film=deferred(f"{RENDERING}:vector_film"),
         expect=check_simulator,
     ),
-    distance=distance,
-    paper=Paper(PUBLISHED, omega="1.6", ours="0.6"),
-    recorder=Recorder(
-        "steer",
-        "Lead the agent, the brown dot, to where it should go; each time other objects stand elsewhere.",
-        deferred(f"{STEERING}:scene"),
-        deferred(f"{STEERING}:record"),
-        tuple(dict.fromkeys((*TRAINING_CONCEPTS, *(goal for name in ("paper", "validation") for goal in SUITES[name].goals)))),
+    comparison=Comparison(
+        headline="closed loop success",
+        references={"nearest object": _nearest, "random object": _random, "expert (oracle)": _oracle},
+        distance=distance,
+        paper=Paper(PUBLISHED, omega="1.6", ours="0.6"),
+    ),
+    recordings=Recordings(
+        recorder=Recorder(
+            "steer",
+            "Lead the agent, the brown dot, to where it should go; each time other objects stand elsewhere.",
+            deferred(f"{STEERING}:scene"),
+            deferred(f"{STEERING}:record"),
+            tuple(dict.fromkeys((*TRAINING_CONCEPTS, *(goal for name in ("paper", "validation") for goal in SUITES[name].goals)))),
+        )
     ),
 )

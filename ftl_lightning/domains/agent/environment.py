@@ -1,40 +1,94 @@
 """Gymnasium environment in pybullet: a cone is pushed over a plane with two fixed objects."""
 
+import math
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from ftl_lightning.domains.agent.bodies import Mesh, bowl, cone
-from ftl_lightning.domains.agent.dynamics import DRAG, MARGIN, MASS, MAX_FORCE, MAX_STEPS, RADIUS, STEP, SUBSTEPS
 from ftl_lightning.domains.agent.scenes import (
     AGENT_START,
     COLOURS,
+    DRAG,
     HEIGHT,
     INITIAL,
+    MARGIN,
+    MASS,
+    MAX_FORCE,
+    MAX_STEPS,
     OBJECT_COLUMNS,
     OBSERVED,
     PLANE,
+    RADIUS,
     REACH,
     STATE,
+    STEP,
+    SUBSTEPS,
     Look,
     check,
     looks,
     scenes,
 )
-from ftl_lightning.domains.physics import Simulator, pybullet
-from ftl_lightning.services.errors import UserError
+from ftl_lightning.domains.execution import Simulator, pybullet
+from ftl_lightning.services.errors import UserError, require
 
 BOWL_THICKNESS = 0.025
 FLOOR = [2.2, 0.01, 1.1]
 """Half extents of the drawn floor."""
 IMAGE = (200, 320)
 """Height and width of a rendered picture."""
-
-
 Seen = dict[str, NDArray[np.float32]]
 """Observed features by name."""
+Mesh = tuple[list[list[float]], list[int]]
+"""Vertices ``[x, y, z]`` in metres, y up, and triangles as a flat list of vertex indices, counter-clockwise from outside."""
+SEGMENTS = 24
+"""Segments of a full turn of a mesh."""
+
+
+def revolve(profile: Sequence[tuple[float, float]]) -> Mesh:
+    """Rotate a closed profile around the y axis.
+
+    Args:
+        profile: ``(radius, y)`` from the lower pole to the upper one along the outside of the body; both ends on the axis.
+    """
+    vertices: list[list[float]] = []
+    for radius, y in profile:
+        for step in range(SEGMENTS):
+            angle = 2 * math.pi * step / SEGMENTS
+            vertices.append([radius * math.sin(angle), y, radius * math.cos(angle)])
+    triangles: list[int] = []
+    for ring in range(len(profile) - 1):
+        for step in range(SEGMENTS):
+            here, right = ring * SEGMENTS + step, ring * SEGMENTS + (step + 1) % SEGMENTS
+            above, above_right = here + SEGMENTS, right + SEGMENTS
+            triangles += [here, right, above_right, here, above_right, above]
+    return vertices, triangles
+
+
+def cone(radius: float, half_height: float) -> Mesh:
+    """Cone standing on its base, centred at half its height."""
+    return revolve([(0.0, -half_height), (radius, -half_height), (0.0, half_height)])
+
+
+def bowl(radius: float, half_height: float, thickness: float, rings: int = 6) -> Mesh:
+    """Concave open shell between two half ellipsoids.
+
+    Args:
+        radius: outer radius of the rim.
+        half_height: half the height; the centre is at half the height.
+        thickness: thickness of the wall.
+        rings: rings of each surface.
+    """
+    height = 2 * half_height
+    angles = [math.pi / 2 * ring / rings for ring in range(rings + 1)]
+    outside = [(radius * math.sin(a), half_height - height * math.cos(a)) for a in angles]
+    inside = [((radius - thickness) * math.sin(a), half_height - (height - thickness) * math.cos(a)) for a in reversed(angles)]
+    return revolve([*outside, *inside])
+
+
+MESHES = {"cone": cone(RADIUS["cone"], HEIGHT), "bowl": bowl(RADIUS["bowl"], HEIGHT, BOWL_THICKNESS)}
 
 
 class AgentEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
@@ -116,20 +170,19 @@ class AgentEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         rgba = [*(value / 255 for value in COLOURS[colour]), 1.0]
         if shape == "sphere":
             form: dict[str, Any] = {"shapeType": pybullet().GEOM_SPHERE, "radius": RADIUS[shape]}
-            seen = form
+            visual = form
         elif shape == "cube":
-            form = {"shapeType": pybullet().GEOM_BOX, "halfExtents": [RADIUS[shape]] * 3}
-            seen = form
+            visual = form = {"shapeType": pybullet().GEOM_BOX, "halfExtents": [RADIUS[shape]] * 3}
         else:
-            vertices, triangles = _MESHES[shape]
+            vertices, triangles = MESHES[shape]
             form = {"shapeType": pybullet().GEOM_MESH, "vertices": vertices}
+            visual = form | {"indices": triangles}
             if shape == "bowl":  # with its triangles it stays concave; without, pybullet takes the convex hull
-                form |= {"indices": triangles, "flags": pybullet().GEOM_FORCE_CONCAVE_TRIMESH}
-            seen = {"shapeType": pybullet().GEOM_MESH, "vertices": vertices, "indices": triangles}
+                form = visual | {"flags": pybullet().GEOM_FORCE_CONCAVE_TRIMESH}
         body: int = client.createMultiBody(
             baseMass=mass,
             baseCollisionShapeIndex=client.createCollisionShape(**form),
-            baseVisualShapeIndex=client.createVisualShape(**seen, rgbaColor=rgba),
+            baseVisualShapeIndex=client.createVisualShape(**visual, rgbaColor=rgba),
             basePosition=position.tolist(),
         )
         client.changeDynamics(body, -1, lateralFriction=0)
@@ -149,8 +202,8 @@ class AgentEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
             UserError: for an action of the wrong size or with numbers that are not finite.
         """
         force = np.asarray(action, dtype=np.float64)
-        if force.shape != (len(PLANE),) or not np.isfinite(force).all():
-            raise UserError(f"agent action: expected {len(PLANE)} finite numbers, found {force.tolist()}")
+        valid = force.shape == (len(PLANE),) and np.isfinite(force).all()
+        require(valid, "agent action", f"{len(PLANE)} finite numbers", str(force.tolist()))
         force = force * min(1.0, MAX_FORCE / max(float(np.linalg.norm(force)), 1e-12))
         for _ in range(SUBSTEPS):  # pybullet forgets a force after each of its steps
             here = self.client.getBasePositionAndOrientation(self._agent)[0]
@@ -181,9 +234,3 @@ class AgentEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         """Stop the simulator."""
         if self.client.isConnected():
             self.client.disconnect()
-
-
-_MESHES: dict[str, Mesh] = {
-    "cone": cone(RADIUS["cone"], HEIGHT),
-    "bowl": bowl(RADIUS["bowl"], HEIGHT, BOWL_THICKNESS),
-}

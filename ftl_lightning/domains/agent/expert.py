@@ -1,20 +1,42 @@
-"""Expert that drives to the target in the same physics and avoids the distractor."""
+"""Expert that drives to the target in the same physics and avoids the distractor, and the source of its demonstrations."""
 
 import itertools
-from collections.abc import Callable
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ftl_lightning.domains.agent.dynamics import LOOKAHEAD, STEP, check_simulator
-from ftl_lightning.domains.agent.scenes import INITIAL, OBSERVED, PLANE, object_positions, scenes, target
+from ftl_lightning.data.demonstrations import Demonstrations
+from ftl_lightning.data.features import InitialStates
+from ftl_lightning.data.formats.files import cached
+from ftl_lightning.domains.agent import scenes as world
+from ftl_lightning.domains.agent.scenes import (
+    LOOKAHEAD,
+    OBSERVED,
+    PLANE,
+    STATE,
+    STEP,
+    check_simulator,
+    object_positions,
+    scenes,
+    target,
+)
+from ftl_lightning.domains.agent.tasks import TRAINING_CONCEPTS
+from ftl_lightning.domains.domain import Split
+from ftl_lightning.services.seeding import VALIDATION_SEED
 
 if TYPE_CHECKING:
     from ftl_lightning.domains.agent.environment import AgentEnvironment
 
+NAME = "agent"
+STATE_NAMES = tuple(
+    f"agent.{column}"
+    for column in ("x", "y", "z", "qx", "qy", "qz", "qw", "vx", "vy", "vz", "angular vx", "angular vy", "angular vz")
+)
+STATE_UNITS = ("m",) * 3 + ("1",) * 4 + ("m/s",) * 3 + ("rad/s",) * 3
 LENGTH = 150
 """States of a demonstration, padded with the last state (paper)."""
 SPEED = 0.4
@@ -25,6 +47,17 @@ STOP = 0.26
 """Distance of the end of the route from the target's centre in metres, just before contact."""
 AT_REST = 0.02
 """Speed in m/s below which the agent is at rest."""
+
+_PHYSICS = ("STEP", "SUBSTEPS", "DRAG", "MASS", "MAX_FORCE", "RADIUS", "LOOKAHEAD", "MARGIN", "COLOURS", "SHAPES")
+_LAYOUT = ("AGENT_START", "OBJECT_X", "OBJECT_Z", "AGENT_CLEARANCE", "OBJECT_CLEARANCE")
+_SETTINGS = {name: getattr(world, name) for name in (*_PHYSICS, *_LAYOUT)} | {
+    "LENGTH": LENGTH,
+    "SPEED": SPEED,
+    "KEEP_CLEAR": KEEP_CLEAR,
+    "STOP": STOP,
+    "AT_REST": AT_REST,
+}
+"""Settings that determine demonstrations besides task, count and seed (cache key)."""
 
 Plane = NDArray[np.float64]
 
@@ -54,32 +87,32 @@ def along(corners: Plane, distance: float) -> Plane:
     return np.asarray(corners[-1])
 
 
-def demonstrate(environment: "AgentEnvironment", initial: NDArray[np.float32], chosen: int) -> NDArray[np.float32]:
+def demonstrate(env: "AgentEnvironment", initial: NDArray[np.float32], chosen: int) -> NDArray[np.float32]:
     """Observations ``(time, 52)`` of a drive, ``time`` at most :data:`LENGTH`.
 
     Args:
-        environment: environment; it is reset.
+        env: environment; it is reset.
         initial: ``(52,)``.
         chosen: 0 or 1, the object to drive to.
     """
     objects = object_positions(torch.from_numpy(initial)[None])[0].double().numpy()[:, PLANE]
     place = initial[list(PLANE)].astype(np.float64)
-    return follow(environment, initial, route(place, objects[chosen], objects[1 - chosen]))
+    return follow(env, initial, route(place, objects[chosen], objects[1 - chosen]))
 
 
-def follow(environment: "AgentEnvironment", initial: NDArray[np.float32], corners: Plane) -> NDArray[np.float32]:
+def follow(env: "AgentEnvironment", initial: NDArray[np.float32], corners: Plane) -> NDArray[np.float32]:
     """Observations ``(time, 52)`` of a drive along a route at the expert's speed, until rest at its end.
 
     Args:
-        environment: environment; it is reset.
+        env: environment; it is reset.
         initial: ``(52,)``.
         corners: corners of the route ``(2 or more, 2)`` in x and z; the drive is cut at :data:`LENGTH` states.
     """
-    observation = environment.reset(options={"scene": initial})[0][OBSERVED]
+    observation = env.reset(options={"scene": initial})[0][OBSERVED]
     seen = [observation]
     for step in range(LENGTH - 1):
         ahead = along(corners, (step + LOOKAHEAD) * STEP * SPEED)
-        observation = environment.step((ahead - observation[list(PLANE)]).astype(np.float32))[0][OBSERVED]
+        observation = env.step((ahead - observation[list(PLANE)]).astype(np.float32))[0][OBSERVED]
         seen.append(observation)
         near = np.linalg.norm(corners[-1] - observation[list(PLANE)]) < 0.02
         if near and np.linalg.norm(observation[7:10]) < AT_REST:
@@ -87,29 +120,78 @@ def follow(environment: "AgentEnvironment", initial: NDArray[np.float32], corner
     return np.stack(seen)
 
 
-def demonstrations(task: str, count: int, seed: int, progress: Callable[[], None]) -> tuple[Tensor, Tensor]:
-    """Expert drives of a task.
+def environment() -> "AgentEnvironment":
+    """Environment of the domain.
 
-    Args:
-        task: see :func:`~ftl_lightning.domains.agent.scenes.parse`.
-        count, seed: number and seed of scenes.
-        progress: called after each drive.
-
-    Returns:
-        Observations ``(count, 150, 52)``, padded with the last, and lengths ``(count,)``.
+    Raises:
+        UserError: without the simulator, or if it does not start.
     """
-    initial = scenes(task, count, seed)
     check_simulator()
     from ftl_lightning.domains.agent.environment import AgentEnvironment
 
-    observations = torch.empty(count, LENGTH, INITIAL)
-    lengths = torch.empty(count, dtype=torch.int64)
-    environment = AgentEnvironment()
-    for row, (state, chosen) in enumerate(zip(initial.numpy(), target(task, initial).tolist(), strict=True)):
-        seen = torch.from_numpy(demonstrate(environment, state, chosen))
-        observations[row, : len(seen)] = seen
-        observations[row, len(seen) :] = seen[-1]
-        lengths[row] = len(seen)
+    return AgentEnvironment()
+
+
+def demonstrations(tasks: tuple[str, ...], count: int, seed: int) -> Demonstrations:
+    """``count`` expert drives of each task, from the cache if present."""
+    return cached(
+        {"domain": NAME, "tasks": tasks, "count": count, "seed": seed, **_SETTINGS},
+        len(tasks) * count,
+        lambda progress: _drive(tasks, count, seed, progress),
+    )
+
+
+def _drive(tasks: tuple[str, ...], count: int, seed: int, progress: Callable[[], None]) -> Demonstrations:
+    """Drive in new scenes.
+
+    Args:
+        tasks: see :func:`~ftl_lightning.domains.agent.scenes.parse`.
+        count, seed: number and seed of each task's scenes.
+        progress: called after each drive.
+    """
+    initial = [scenes(task, count, seed) for task in tasks]
+    chosen = torch.cat([target(task, states) for task, states in zip(tasks, initial, strict=True)])
+    env, driven = environment(), []
+    for state, index in zip(torch.cat(initial).numpy(), chosen.tolist(), strict=True):
+        driven.append(torch.from_numpy(demonstrate(env, state, index)))
         progress()
-    environment.close()
-    return observations, lengths
+    env.close()
+    times = torch.arange(LENGTH)
+    observations = torch.stack([drive[times.clamp(max=len(drive) - 1)] for drive in driven])
+    lengths = torch.tensor([len(drive) for drive in driven])
+    concepts = tuple(task for task in tasks for _ in range(count))
+    return drives(observations, lengths, concepts, {"generator": NAME, "seed": seed, "count_per_task": count})
+
+
+def drives(observations: Tensor, lengths: Tensor, concepts: tuple[str, ...], provenance: Mapping[str, Any]) -> Demonstrations:
+    """Convert drives ``(demo, time, 52)`` to demonstrations."""
+    return Demonstrations(
+        states=observations[..., :STATE].contiguous(),
+        lengths=lengths,
+        domain=NAME,
+        state_names=STATE_NAMES,
+        state_units=STATE_UNITS,
+        concepts=concepts,
+        observed={OBSERVED: observations},
+        per_step=(OBSERVED,),
+        scenes=observations[:, 0].contiguous(),
+        provenance=provenance,
+    )
+
+
+class Expert:
+    """Source of expert drives, cached."""
+
+    def split(self, name: Split, count: int, seed: int) -> Demonstrations:
+        return demonstrations(TRAINING_CONCEPTS, count, seed if name == "train" else VALIDATION_SEED + seed)
+
+    def draw(self, task: str, count: int, seed: int, workers: int = 1) -> Demonstrations:
+        return demonstrations((task,), count, seed)
+
+    def starts(self, task: str, count: int, seed: int) -> InitialStates:
+        return initial_states(scenes(task, count, seed))
+
+
+def initial_states(drawn: Tensor) -> InitialStates:
+    """Initial states of scenes ``(scene, 52)``, which are fully observed."""
+    return InitialStates({OBSERVED: drawn}, drawn)

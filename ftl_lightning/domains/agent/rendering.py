@@ -3,17 +3,16 @@
 from collections.abc import Sequence
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor
 
 from ftl_lightning.data.features import InitialStates, check_starts
-from ftl_lightning.domains.agent.dynamics import check_simulator
+from ftl_lightning.domains.agent.expert import environment
 from ftl_lightning.domains.agent.scenes import COLOURS, OBSERVED, PLANE, REACH, looks, object_positions
-from ftl_lightning.domains.rollout import Rollout
-from ftl_lightning.domains.vector_film import Shape, VectorFilm, regular, some, still
-from ftl_lightning.services.escape import figure_text
+from ftl_lightning.domains.execution import Rollout
+from ftl_lightning.domains.films import Shape, VectorFilm, regular, some, still
+from ftl_lightning.domains.pictures import framed
 
 MARKERS = {"cone": "^", "sphere": "o", "bowl": "v", "cube": "s"}
 """Markers; a bowl is an open triangle pointing down."""
@@ -24,6 +23,11 @@ SEEN = (-2.1, 2.1), (-4.8, -2.8)
 MAX_COLUMNS = 4
 FRAMES = 40
 """Maximum number of frames of an episode."""
+SIZE = 0.1
+"""Half the width of a body in metres."""
+AGENT = "#c79a2b"
+STEPS_A_SECOND = 30.0
+"""Simulation steps per second of a vector film: 1.5 times real time."""
 
 
 def render(states: Tensor, right: Sequence[bool] | None, title: str, starts: InitialStates | None) -> Figure:
@@ -35,32 +39,18 @@ def render(states: Tensor, right: Sequence[bool] | None, title: str, starts: Ini
         title: title above the grid.
         starts: initial states with ``world (scene, 52)``.
     """
-    columns = min(len(states), MAX_COLUMNS)
-    rows = -(-len(states) // columns)
-    figure = Figure(figsize=(2.6 * columns, 1.3 * rows + 0.4), layout="constrained")
-    figure.suptitle(figure_text(title), fontsize=9)
-    frames = ["#8a8a8a"] * len(states) if right is None else ["#2e9e46" if good else "#d03a3a" for good in right]
-    grid = figure.subplots(rows, columns, squeeze=False).flat
-    for axes, plan, initial, frame in zip(grid, states, check_starts(starts).observed[OBSERVED], frames, strict=False):
-        _scene(axes, plan, initial, frame)
-    for axes in figure.axes[len(states) :]:
-        axes.set_axis_off()
+    figure = framed(len(states), right, title, MAX_COLUMNS, (2.6, 1.3))
+    for axes, plan, initial in zip(figure.axes, states, check_starts(starts).observed[OBSERVED], strict=False):
+        places = object_positions(initial[None])[0][:, list(PLANE)].tolist()
+        for (colour, shape), (x, z) in zip(looks(initial.tolist()), places, strict=True):
+            shade = [value / 255 for value in COLOURS[colour]]
+            axes.plot(x, z, MARKERS[shape], color=shade, fillstyle="none" if shape == "bowl" else "full", markersize=9, mew=2)
+            angle = np.linspace(0, 2 * np.pi, 48)
+            axes.plot(x + REACH * np.cos(angle), z + REACH * np.sin(angle), color="#c0c0c0", linewidth=0.6)
+        axes.plot(*plan[:, list(PLANE)].T.tolist(), color="#303030", linewidth=1)
+        axes.plot(initial[0].item(), initial[2].item(), "^", color=AGENT, markersize=7)
+        axes.set(xlim=SEEN[0], ylim=SEEN[1], xticks=[], yticks=[])
     return figure
-
-
-def _scene(axes: Axes, plan: Tensor, initial: Tensor, frame: str) -> None:
-    places = object_positions(initial[None])[0][:, list(PLANE)].tolist()
-    for (colour, shape), (x, z) in zip(looks(initial.tolist()), places, strict=True):
-        shade = [value / 255 for value in COLOURS[colour]]
-        axes.plot(x, z, MARKERS[shape], color=shade, fillstyle="none" if shape == "bowl" else "full", markersize=9, mew=2)
-        angle = np.linspace(0, 2 * np.pi, 48)
-        axes.plot(x + REACH * np.cos(angle), z + REACH * np.sin(angle), color="#c0c0c0", linewidth=0.6)
-    x, z = plan[:, list(PLANE)].T.tolist()
-    axes.plot(x, z, color="#303030", linewidth=1)
-    axes.plot(initial[0].item(), initial[2].item(), "^", color="#c79a2b", markersize=7)
-    axes.set(xlim=SEEN[0], ylim=SEEN[1], xticks=[], yticks=[], aspect="equal")
-    for spine in axes.spines.values():
-        spine.set(color=frame, linewidth=2.0)
 
 
 def _end(observations: Tensor) -> int:
@@ -74,25 +64,15 @@ def film(rollout: Rollout, plans: Tensor) -> list[NDArray[np.uint8]]:
 
     Plans are not drawn: the simulator renders the frames.
     """
-    check_simulator()
-    from ftl_lightning.domains.agent.environment import AgentEnvironment
-
     observations = rollout.observed[OBSERVED][0]
     times = some(_end(observations), FRAMES)
-    environment = AgentEnvironment()
+    env = environment()
     pictures = []
     for time in times:
-        environment.reset(options={"scene": observations[time].numpy()})
-        pictures.append(environment.render())
-    environment.close()
+        env.reset(options={"scene": observations[time].numpy()})
+        pictures.append(env.render())
+    env.close()
     return pictures
-
-
-SIZE = 0.1
-"""Half the width of a body in metres."""
-AGENT = "#c79a2b"
-STEPS_A_SECOND = 30.0
-"""Simulation steps per second of a vector film: 1.5 times real time."""
 
 
 def vector_film(rollout: Rollout) -> VectorFilm:

@@ -1,4 +1,4 @@
-"""Scenes: objects, goals, pairs of objects per task, and the layout of initial states.
+"""Scenes: objects, goals, pairs of objects per task, the layout of initial states, and constants of the physics.
 
 Axes: x right, y up, z forward; metres. The agent starts at :data:`AGENT_START`; object 1 stands to its right, object 2 to its left.
 """
@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ftl_lightning.data.features import Feature
-from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.errors import UserError, require
+from ftl_lightning.services.extras import check_extra
 from ftl_lightning.services.seeding import task_key
 
 COLOURS = {"red": (255, 87, 34), "yellow": (217, 191, 119), "purple": (149, 56, 158), "green": (148, 252, 19)}
@@ -55,6 +56,24 @@ FEATURE = Feature(
     attributes=tuple(range(3, 3 + _TAIL - len(TYPES))),
     state=tuple(range(STATE)),
 )
+
+STEP = 0.05
+"""Seconds between states."""
+SUBSTEPS = 6
+MAX_STEPS = 128
+LOOKAHEAD = 5
+"""An action is the displacement to the plan's state this many steps ahead (paper: a_t = tau_{t+5} - s_t)."""
+DRAG = 16.0
+"""Decay rate of the agent's speed per second, high enough to avoid overshooting."""
+MASS = LOOKAHEAD * STEP / DRAG
+"""Mass in kg. A plan at constant speed v is LOOKAHEAD * STEP * v ahead, and drag is MASS * DRAG * v: with this mass, the
+displacement in metres, applied as a force in newtons, keeps the agent at the plan's speed."""
+MAX_FORCE = 0.2
+"""Maximum force in newtons; larger forces are scaled down."""
+RADIUS = {"cone": 0.11, "sphere": HEIGHT, "bowl": 0.13, "cube": HEIGHT}
+"""Radius of the bodies' footprints in metres; half the edge of a cube."""
+MARGIN = 0.001
+"""Gap in metres that the simulator keeps between cone and ground; the ground is lowered by it to avoid hopping."""
 
 TRAINING_GROUPS = (
     tuple(itertools.product(("red", "yellow"), ("cone", "sphere"))),
@@ -220,12 +239,20 @@ def check(initial: Sequence[float] | NDArray[np.float32]) -> NDArray[np.float32]
         UserError: for a wrong size, numbers that are not finite, or bodies that overlap.
     """
     state = np.asarray(initial, dtype=np.float32)
-    if state.shape != (INITIAL,):
-        raise UserError(f"initial state: expected {INITIAL} numbers, found shape {state.shape}")
-    if not np.isfinite(state).all():
-        raise UserError("initial state: expected finite numbers, found others")
+    require(state.shape == (INITIAL,), "initial state", f"{INITIAL} numbers", f"shape {state.shape}")
+    require(np.isfinite(state).all(), "initial state", "finite numbers", "others")
     centres = {"the agent": state[:3]} | {f"object {1 + i}": state[columns][:3] for i, columns in enumerate(OBJECT_COLUMNS)}
     for (a, first), (b, second) in itertools.combinations(centres.items(), 2):
-        if (distance := float(np.linalg.norm(first - second))) < LEAST_DISTANCE:
-            raise UserError(f"initial state: {a} and {b} overlap: expected centres {LEAST_DISTANCE} m apart, found {distance:.3f}")
+        apart = float(np.linalg.norm(first - second))
+        expected = f"centres {LEAST_DISTANCE} m apart"
+        require(apart >= LEAST_DISTANCE, f"initial state: {a} and {b} overlap", expected, f"{apart:.3f}")
     return state
+
+
+def check_simulator() -> None:
+    """Check that pybullet is installed.
+
+    Raises:
+        UserError: with the command that installs it.
+    """
+    check_extra("navigation", "domain agent: its simulator")

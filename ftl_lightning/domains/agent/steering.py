@@ -4,15 +4,12 @@ import numpy as np
 import torch
 
 from ftl_lightning.data.demonstrations import Demonstrations
-from ftl_lightning.domains.agent.domain import NAME, drives, environment, initial_states
-from ftl_lightning.domains.agent.dynamics import STEP, check_simulator
-from ftl_lightning.domains.agent.expert import LENGTH, SPEED, STOP, Plane, follow
+from ftl_lightning.domains.agent.expert import LENGTH, NAME, SPEED, STOP, Plane, drives, environment, follow, initial_states
 from ftl_lightning.domains.agent.rendering import SEEN, STEPS_A_SECOND, from_above
-from ftl_lightning.domains.agent.scenes import OBSERVED, PLANE, object_positions, scenes
+from ftl_lightning.domains.agent.scenes import OBSERVED, PLANE, STEP, check_simulator, object_positions, scenes
 from ftl_lightning.domains.agent.tasks import COMPOSITIONS
-from ftl_lightning.domains.hand_line import at_even_steps, reached, smoothed
-from ftl_lightning.domains.recorder import Numbers, Piece, Scene
-from ftl_lightning.services.errors import UserError
+from ftl_lightning.domains.recorder import Numbers, Piece, Scene, at_even_steps, reached, smoothed
+from ftl_lightning.services.errors import require
 
 BRAKING = 20
 """States of a demonstration reserved for braking."""
@@ -45,24 +42,24 @@ def scene(task: str, seed: int) -> Scene:
     return Scene(film, (agent,), faster * SPEED, LONGEST / (faster * SPEED), initial_states(world))
 
 
-def record(seen: Scene, path: Numbers, seconds: Numbers) -> Demonstrations:
+def record(scene_before: Scene, path: Numbers, seconds: Numbers) -> Demonstrations:
     """Drive along the drawn route at the expert's speed, to just before the first object on it.
 
     Args:
-        seen: scene before the drive.
+        scene_before: scene before the drive.
         path: ``(step, 1, 2)``, x and z in metres, clipped to the picture.
         seconds: ignored, as the speed of the hand is not a property of the drive.
 
     Raises:
         UserError: for a route shorter than :data:`SHORTEST`, or without the simulator.
     """
-    assert seen.starts is not None  # set by `scene`
-    world = seen.starts.observed[OBSERVED]
+    assert scene_before.starts is not None  # set by `scene`
+    world = scene_before.starts.observed[OBSERVED]
     start = world[:, list(PLANE)].double().numpy()
     (left, right), (low, high) = SEEN
     hand = np.concatenate((start, path[:, 0].clip((left, low), (right, high))))
-    if (length := reached(hand)[-1]) < SHORTEST:
-        raise UserError(f"way: expected one of at least {SHORTEST:g} m, found {length:.2f} m; lead the agent further")
+    length = reached(hand)[-1]
+    require(length >= SHORTEST, "way", f"one of at least {SHORTEST:g} m", f"{length:.2f} m; lead the agent further")
     way = _before_objects(smoothed(hand, BLUR), object_positions(world)[0].double().numpy()[:, PLANE])
     env = environment()
     try:

@@ -12,8 +12,8 @@ from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.distances import path_distance
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.data.formats.files import cached
-from ftl_lightning.domains.deferred import deferred
-from ftl_lightning.domains.domain import ClosedLoop, Concepts, Domain, Plans, Show, Split
+from ftl_lightning.domains.comparison import Comparison, Paper
+from ftl_lightning.domains.domain import Concepts, Domain, Plans, Split, deferred
 from ftl_lightning.domains.driving import policies
 from ftl_lightning.domains.driving.motion import turned
 from ftl_lightning.domains.driving.published import PUBLISHED
@@ -37,8 +37,8 @@ from ftl_lightning.domains.driving.traffic import (
     scene,
 )
 from ftl_lightning.domains.driving.views import VIEWS
-from ftl_lightning.domains.paper import Paper
-from ftl_lightning.domains.rollout import Rollout
+from ftl_lightning.domains.execution import ClosedLoop, Rollout
+from ftl_lightning.domains.pictures import Show
 
 if TYPE_CHECKING:
     from ftl_lightning.domains.driving.environment import DrivingEnvironment
@@ -146,7 +146,6 @@ DOMAIN = Domain(
     ),
     source=Expert,
     observed=FEATURES_SEEN,
-    headline="closed loop strict success",
     show=Show(deferred(f"{RENDERING}:render"), vector_film=deferred(f"{RENDERING}:plan_film")),
     views=VIEWS,
     closed_loop=ClosedLoop(
@@ -162,7 +161,10 @@ DOMAIN = Domain(
         policies=policies.POLICIES,
         expect=check_simulator,
     ),
-    distance=distance,
-    fresh=False,  # the expert takes about four seconds per episode
-    paper=Paper(PUBLISHED, omega="learned", ours="learned"),
+    comparison=Comparison(
+        headline="closed loop strict success",
+        distance=distance,
+        fresh=False,  # the expert takes about four seconds per episode
+        paper=Paper(PUBLISHED, omega="learned", ours="learned"),
+    ),
 )

@@ -9,12 +9,12 @@ from torch import Tensor
 
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import InitialStates, Observed
-from ftl_lightning.domains.domain import Policy
 from ftl_lightning.domains.driving.motion import drive
 from ftl_lightning.domains.driving.shipped import training_set
 from ftl_lightning.domains.driving.tasks import TRAINING_CONCEPTS
 from ftl_lightning.domains.driving.traffic import STATE, TRAFFIC, check_simulator, origin
 from ftl_lightning.domains.driving.views import VIEWS
+from ftl_lightning.domains.execution import Policy
 from ftl_lightning.services.seeding import generator
 
 if TYPE_CHECKING:

@@ -3,8 +3,8 @@
 Its success rate counts any vehicle past the roundabout, crashed or not.
 """
 
+from ftl_lightning.domains.comparison import Published
 from ftl_lightning.domains.driving.tasks import NEW
-from ftl_lightning.domains.paper import Published
 
 SUCCESS, CRASH = "closed loop success (step veto)", "closed loop crash (step veto)"
 

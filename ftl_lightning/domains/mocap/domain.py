@@ -5,15 +5,15 @@ from pathlib import Path
 from torch import Tensor
 
 from ftl_lightning.data.features import InitialStates, check_starts
-from ftl_lightning.domains.deferred import deferred
-from ftl_lightning.domains.domain import ACCURACY, Concepts, Domain, Metric, Plans, Show
+from ftl_lightning.domains.comparison import OURS, WITH_KNOTS, WITH_MODES, Compared, Comparison
+from ftl_lightning.domains.domain import ACCURACY, Concepts, Domain, Metric, Plans, Recordings, deferred
 from ftl_lightning.domains.mocap.actions import TESTED, action, judged
 from ftl_lightning.domains.mocap.judge import identity
 from ftl_lightning.domains.mocap.skeleton import COLUMNS, GROUPS, HORIZON
 from ftl_lightning.domains.mocap.source import NAME, OBSERVED, POSE, Recorded
 from ftl_lightning.domains.mocap.tasks import NEW_CONCEPTS, SUITES, TRAINING_CONCEPTS
 from ftl_lightning.domains.mocap.views import VIEWS
-from ftl_lightning.domains.paper import OURS, WITH_KNOTS, WITH_MODES, Compared
+from ftl_lightning.domains.pictures import Show
 from ftl_lightning.domains.tasks import training_suite
 
 _DRAWING, _MEASURES = "ftl_lightning.domains.mocap.rendering", "ftl_lightning.domains.mocap.measures"
@@ -45,9 +45,6 @@ DOMAIN = Domain(
         "bone error": Metric(deferred(f"{_MEASURES}:bone_error"), less_is_better=True),
         "jerk": Metric(deferred(f"{_MEASURES}:jerk"), less_is_better=True),
     },
-    ours=Compared(OURS, f"{WITH_MODES} {WITH_KNOTS}"),
-    headline="rule",
-    references={"frozen frame": _frozen},
     views=VIEWS,
     show=Show(
         deferred(f"{_DRAWING}:picture"),
@@ -55,7 +52,14 @@ DOMAIN = Domain(
         deferred(f"{_DRAWING}:wireframe"),
         exports={".bvh": deferred("ftl_lightning.domains.mocap.export:bvh")},
     ),
-    imports={".bvh": deferred("ftl_lightning.domains.mocap.bvh:demonstrated")},
-    prepare=deferred("ftl_lightning.domains.mocap.prepare:prepare"),
-    fresh=False,  # recordings are finite
+    comparison=Comparison(
+        ours=Compared(OURS, f"{WITH_MODES} {WITH_KNOTS}"),
+        headline="rule",
+        references={"frozen frame": _frozen},
+        fresh=False,  # recordings are finite
+    ),
+    recordings=Recordings(
+        prepare=deferred("ftl_lightning.domains.mocap.prepare:prepare"),
+        imports={".bvh": deferred("ftl_lightning.domains.mocap.bvh:demonstrated")},
+    ),
 )

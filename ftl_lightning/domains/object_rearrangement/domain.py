@@ -7,14 +7,11 @@ from torch import Tensor
 
 from ftl_lightning.data.distances import path_distance
 from ftl_lightning.data.features import InitialStates
-from ftl_lightning.domains.deferred import deferred
-from ftl_lightning.domains.domain import ACCURACY, Concepts, Domain, Metric, Plans, Show
-from ftl_lightning.domains.generated import Generated
-from ftl_lightning.domains.object_rearrangement.generation import generate, random_scenes
-from ftl_lightning.domains.object_rearrangement.published import PUBLISHED
-from ftl_lightning.domains.object_rearrangement.relations import PER_SHAPE, SHAPES, holds, parse, sentence
-from ftl_lightning.domains.object_rearrangement.tasks import DESCRIBED, SUITES, TRAINING_CONCEPTS
-from ftl_lightning.domains.paper import Paper
+from ftl_lightning.domains.comparison import Comparison, Paper
+from ftl_lightning.domains.domain import ACCURACY, Concepts, Domain, Generated, Metric, Plans, Recordings, deferred
+from ftl_lightning.domains.object_rearrangement.scenes import PER_SHAPE, SHAPES, generate, holds, parse, random_scenes, sentence
+from ftl_lightning.domains.object_rearrangement.tasks import DESCRIBED, PUBLISHED, SUITES, TRAINING_CONCEPTS
+from ftl_lightning.domains.pictures import Show
 from ftl_lightning.domains.recorder import Recorder
 from ftl_lightning.services.errors import UserError
 
@@ -55,7 +52,6 @@ def distance(states: Tensor, others: Tensor) -> Tensor:
     return path_distance(states[..., CENTRES], others[..., CENTRES])
 
 
-RECORDING = "ftl_lightning.domains.object_rearrangement.recording"
 RENDERING = "ftl_lightning.domains.object_rearrangement.rendering"
 DOMAIN = Domain(
     name=NAME,
@@ -71,16 +67,20 @@ DOMAIN = Domain(
     source=lambda root: Generated(NAME, PLANS, TRAINING_CONCEPTS, lambda task, count, seed: generate(task, count, seed)[:, None]),
     metrics={ACCURACY: Metric(succeeded)},
     show=Show(deferred(f"{RENDERING}:render"), vector_film=deferred(f"{RENDERING}:vector_film")),
-    references={
-        "random scenes": lambda goal, count, starts, seed: random_scenes(count, seed)[:, None],
-        "generator (oracle)": lambda goal, count, starts, seed: generate(goal, count, seed)[:, None],
-    },
-    distance=distance,
-    paper=Paper(PUBLISHED, omega="1.2", ours="1.2"),
-    recorder=Recorder(
-        "arrange",
-        "Put the three shapes where they show what you mean; their sizes are new each time.",
-        deferred(f"{RECORDING}:scene"),
-        deferred(f"{RECORDING}:record"),
+    comparison=Comparison(
+        references={
+            "random scenes": lambda goal, count, starts, seed: random_scenes(count, seed)[:, None],
+            "generator (oracle)": lambda goal, count, starts, seed: generate(goal, count, seed)[:, None],
+        },
+        distance=distance,
+        paper=Paper(PUBLISHED, omega="1.2", ours="1.2"),
+    ),
+    recordings=Recordings(
+        recorder=Recorder(
+            "arrange",
+            "Put the three shapes where they show what you mean; their sizes are new each time.",
+            deferred(f"{RENDERING}:scene"),
+            deferred(f"{RENDERING}:record"),
+        )
     ),
 )

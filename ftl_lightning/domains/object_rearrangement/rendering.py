@@ -1,18 +1,21 @@
-"""Pictures of scenes with a green frame if the task holds, else red (as in the paper's figures)."""
+"""Pictures of scenes with a green frame if the task holds, else red (as in the paper's figures), and scenes arranged by hand."""
 
 import math
 from collections.abc import Sequence
 
 import numpy as np
-from matplotlib.axes import Axes
+import torch
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle, RegularPolygon
+from matplotlib.patches import Circle, Patch, RegularPolygon
 from torch import Tensor
 
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import InitialStates
-from ftl_lightning.domains.object_rearrangement.relations import EXTENT, PER_SHAPE, SHAPES
-from ftl_lightning.domains.vector_film import VectorFilm, regular, still
-from ftl_lightning.services.escape import figure_text
+from ftl_lightning.domains.films import VectorFilm, regular, still
+from ftl_lightning.domains.object_rearrangement.domain import CENTRES, NAME, PLANS
+from ftl_lightning.domains.object_rearrangement.scenes import EXTENT, PER_SHAPE, SHAPES, plain_scene
+from ftl_lightning.domains.pictures import framed
+from ftl_lightning.domains.recorder import Numbers, Piece, Scene
 
 COLOURS = {"circle": "#e4704a", "triangle": "#4c9f70", "square": "#4a78c8"}
 CORNERS = {"triangle": 3, "square": 4}
@@ -30,29 +33,17 @@ def render(states: Tensor, right: Sequence[bool] | None, title: str, starts: Ini
         title: title above the grid.
         starts: unused.
     """
-    columns = min(len(states), MAX_COLUMNS)
-    rows = -(-len(states) // columns)
-    figure = Figure(figsize=(1.5 * columns, 1.5 * rows + 0.4), layout="constrained")
-    figure.suptitle(figure_text(title), fontsize=9)
-    frames = ["#8a8a8a"] * len(states) if right is None else ["#2e9e46" if good else "#d03a3a" for good in right]
-    for axes, state, frame in zip(figure.subplots(rows, columns, squeeze=False).flat, states[:, 0], frames, strict=False):
-        _scene(axes, state, frame)
-    for axes in figure.axes[len(states) :]:
-        axes.set_axis_off()
+    figure = framed(len(states), right, title, MAX_COLUMNS, (1.5, 1.5))
+    for axes, state in zip(figure.axes, states[:, 0], strict=False):
+        for shape, (x, y, radius, angle, *_) in zip(SHAPES, state.unflatten(0, (len(SHAPES), PER_SHAPE)).tolist(), strict=True):
+            size = max(radius, 0.0)
+            if shape in CORNERS:
+                patch: Patch = RegularPolygon((x, y), CORNERS[shape], radius=size, orientation=angle, color=COLOURS[shape])
+            else:
+                patch = Circle((x, y), size, color=COLOURS[shape])
+            axes.add_patch(patch)
+        axes.set(xlim=(-MARGIN, EXTENT + MARGIN), ylim=(-MARGIN, EXTENT + MARGIN), xticks=[], yticks=[])
     return figure
-
-
-def _scene(axes: Axes, state: Tensor, frame: str) -> None:
-    for shape, (x, y, radius, angle, *_) in zip(SHAPES, state.unflatten(0, (len(SHAPES), PER_SHAPE)).tolist(), strict=True):
-        colour = COLOURS[shape]
-        size = max(radius, 0.0)
-        if shape in CORNERS:
-            axes.add_patch(RegularPolygon((x, y), CORNERS[shape], radius=size, orientation=angle, color=colour))
-        else:
-            axes.add_patch(Circle((x, y), size, color=colour))
-    axes.set(xlim=(-MARGIN, EXTENT + MARGIN), ylim=(-MARGIN, EXTENT + MARGIN), xticks=[], yticks=[], aspect="equal")
-    for spine in axes.spines.values():
-        spine.set(color=frame, linewidth=2.5)
 
 
 def vector_film(states: Tensor, starts: InitialStates | None) -> VectorFilm:
@@ -66,3 +57,38 @@ def vector_film(states: Tensor, starts: InitialStates | None) -> VectorFilm:
         else:
             shapes.append(still("dots", [(x, y)], COLOURS[shape], size))
     return VectorFilm(shapes, (-MARGIN, -MARGIN, EXTENT + 2 * MARGIN, EXTENT + 2 * MARGIN), 1.0)
+
+
+def scene(task: str, seed: int) -> Scene:
+    """Three shapes of new sizes without any training relation.
+
+    Args:
+        task: unused.
+        seed: seed of sizes, angles and places.
+    """
+    state = plain_scene(seed)
+    places = state[list(CENTRES)].reshape(len(SHAPES), 2).tolist()
+    pieces = tuple(Piece(shape, (x, y), (number,)) for number, (shape, (x, y)) in enumerate(zip(SHAPES, places, strict=True)))
+    return Scene(vector_film(state[None], None), pieces, state=state)
+
+
+def record(initial: Scene, path: Numbers, seconds: Numbers) -> Demonstrations:
+    """Scene ``(1, 1, 21)`` with the shapes at their final places, centres clipped to [0, :data:`EXTENT`].
+
+    Args:
+        initial: initial scene.
+        path: ``(step, 3, 2)`` in length units; only the last step counts.
+        seconds: unused.
+    """
+    assert initial.state is not None  # set by `scene`
+    state = initial.state.clone()
+    state[list(CENTRES)] = torch.from_numpy(path[-1]).float().clamp(0, EXTENT).flatten()
+    return Demonstrations(
+        states=state[None, None],
+        lengths=torch.ones(1, dtype=torch.int64),
+        domain=NAME,
+        state_names=PLANS.columns,
+        state_units=PLANS.units,
+        concepts=("",),
+        provenance={"generator": "by hand"},
+    )

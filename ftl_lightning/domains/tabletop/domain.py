@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 from torch import Tensor
 
 from ftl_lightning.data.features import Observed
-from ftl_lightning.domains.deferred import deferred
-from ftl_lightning.domains.domain import EXECUTED, ClosedLoop, Concepts, Domain, Plans, Privileged, Show
-from ftl_lightning.domains.paper import Paper, Published
+from ftl_lightning.domains.comparison import Comparison, Paper, Published
+from ftl_lightning.domains.domain import EXECUTED, Concepts, Domain, Plans, Privileged, deferred
+from ftl_lightning.domains.execution import ClosedLoop
+from ftl_lightning.domains.pictures import Show
 from ftl_lightning.domains.tabletop.interface import (
     FEATURES,
     MAX_STEPS,
@@ -124,11 +125,13 @@ DOMAIN = Domain(
     observed=FEATURES,
     privileged={PLACES: Privileged(SEEN, misplaced, told)},
     views=VIEWS,
-    headline=EXECUTED,
     show=Show(deferred(f"{RENDERING}:render"), vector_film=deferred(f"{RENDERING}:plan_film")),
     closed_loop=_LOOP,
-    paper=Paper(PUBLISHED, omega="learned", ours="learned", comparable=False),
-    fresh=False,  # an episode of an expert takes about half a second
+    comparison=Comparison(
+        headline=EXECUTED,
+        fresh=False,  # an episode of an expert takes about half a second
+        paper=Paper(PUBLISHED, omega="learned", ours="learned", comparable=False),
+    ),
 )
 WIDE = replace(
     DOMAIN,
@@ -136,6 +139,6 @@ WIDE = replace(
     concepts=Concepts(training=WIDE_CONCEPTS, suites=WIDE_SUITES, table=Path(__file__).parent / "wide_embeddings.safetensors"),
     source=wide_source,
     closed_loop=replace(_LOOP, environment=wide_environment),
-    paper=None,
+    comparison=replace(DOMAIN.comparison, paper=None),
 )
 """Table-top with more pushes and picks than the paper."""

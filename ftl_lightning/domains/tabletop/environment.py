@@ -7,7 +7,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from ftl_lightning.domains.physics import Simulator, pybullet
+from ftl_lightning.domains.execution import Simulator, pybullet
 from ftl_lightning.domains.tabletop.interface import ACTION, FEATURES, HERTZ, IMAGE, MAX_STEPS, OPEN, POSE, THRESHOLD
 from ftl_lightning.domains.tabletop.scenes import (
     BOOK,

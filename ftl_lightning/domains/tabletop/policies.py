@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import InitialStates
-from ftl_lightning.domains.domain import Policy
+from ftl_lightning.domains.execution import Policy
 from ftl_lightning.domains.tabletop.experts import PUSH_HEIGHT, perform
 from ftl_lightning.domains.tabletop.interface import ACTION, check_simulator
 from ftl_lightning.domains.tabletop.tasks import PUSH, PUSH_ON_BOOK, TASKS, check_task

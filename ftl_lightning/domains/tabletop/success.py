@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ftl_lightning.domains.rollout import Rollout
+from ftl_lightning.domains.execution import Rollout
 from ftl_lightning.domains.tabletop.scenes import BOOK, CIRCLE, COLUMNS, HEIGHT, TARGET, TRIANGLE, WHITE, outline, support, within
 from ftl_lightning.domains.tabletop.tasks import BESIDE, PUSH_ON_BOOK, PUSHES, TO_BOOK, check_task
 

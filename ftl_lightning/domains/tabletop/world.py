@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ftl_lightning.domains.agent.bodies import bowl
-from ftl_lightning.domains.physics import Simulator, pybullet
+from ftl_lightning.domains.agent.environment import bowl
+from ftl_lightning.domains.execution import Simulator, pybullet
 from ftl_lightning.domains.tabletop.scenes import (
     BOOK,
     BOWL,

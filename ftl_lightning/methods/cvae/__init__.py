@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
-from ftl_lightning.domains.paper import WITH_MODES
+from ftl_lightning.domains.comparison import WITH_MODES
 from ftl_lightning.training.method import Form, Method
 
 if TYPE_CHECKING:

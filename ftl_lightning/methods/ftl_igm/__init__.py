@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
-from ftl_lightning.domains.paper import OURS, WITH_ADAPTER, WITH_KNOTS, WITH_MODES
+from ftl_lightning.domains.comparison import OURS, WITH_ADAPTER, WITH_KNOTS, WITH_MODES
 from ftl_lightning.training.method import Form, Method
 
 if TYPE_CHECKING:

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from ftl_lightning.domains.paper import FINE_TUNED
+from ftl_lightning.domains.comparison import FINE_TUNED
 from ftl_lightning.methods.ftl_igm import METHOD as OURS
 from ftl_lightning.training.method import Method
 

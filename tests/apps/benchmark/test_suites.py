@@ -90,7 +90,9 @@ def test_the_judge_knows_fresh_behaviour_and_nothing_else(name: str) -> None:
     for task in suite.test[:2]:
         rates = {
             line: float(
-                domain.measure(task.concept, domain.references[line](task.concept, 40, None, 0), None)["accuracy"].float().mean()
+                domain.measure(task.concept, domain.comparison.references[line](task.concept, 40, None, 0), None)["accuracy"]
+                .float()
+                .mean()
             )
             for line in (ORACLE, CHANCE)
         }

@@ -8,7 +8,7 @@ import torch
 from matplotlib.figure import Figure
 from PIL import Image
 
-from ftl_lightning.domains.line_plots import MAX_COLUMNS, film, picture
+from ftl_lightning.domains.pictures import MAX_COLUMNS, film, line_drawings
 
 
 def plans(count: int, time: int, columns: int) -> torch.Tensor:
@@ -17,7 +17,7 @@ def plans(count: int, time: int, columns: int) -> torch.Tensor:
 
 def drawn(states: torch.Tensor, right: list[bool] | None = None) -> Figure:
     names = [f"column {number}" for number in range(states.shape[2])]
-    return picture(names)(states, right, "a title", None)
+    return line_drawings(names).picture(states, right, "a title", None)
 
 
 @pytest.mark.parametrize("columns", [2, 3])
@@ -71,7 +71,7 @@ def test_many_plans_stand_in_rows_and_single_states_and_behaviour_that_stands_st
 @pytest.mark.parametrize("columns", [2, 3])
 @pytest.mark.parametrize(("time", "frames"), [(1, 1), (5, 5), (18, 6)])
 def test_a_film_shows_the_path_as_it_is_drawn(columns: int, time: int, frames: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ftl_lightning.domains.line_plots.MAX_FRAMES", 6)
+    monkeypatch.setattr("ftl_lightning.domains.pictures.MAX_FRAMES", 6)
     found = film(plans(1, time, columns)[0])
     assert len(found) == frames
     assert {one.shape for one in found} == {found[0].shape}

@@ -1,18 +1,22 @@
-"""Wireframes, motion as points and lines in space, for films of bodies here and on web pages.
+"""Films as data: moving shapes in the plane, and wireframes, moving points and lines in space.
 
-The view is fixed, from the front and slightly from the side and above, in parallel projection, so that lengths are comparable
-within and between films.
+Web pages draw both at any size, in a hundredth of the bytes of pictures. Wireframes are seen from a fixed direction, from the front
+and slightly from the side and above, in parallel projection, so that lengths are comparable within and between films.
 """
 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
+Kind = Literal["area", "line", "dots", "way"]
 Points = NDArray[np.float32]
+Frames = list[NDArray[np.uint8]]
+"""Pictures ``(height, width, 3)``."""
 
 SIDE, ABOVE = math.radians(28), math.radians(12)
 """View direction: rotation about the vertical towards +x, and elevation."""
@@ -21,6 +25,49 @@ SIZE = 240
 FINER = 3
 """Supersampling factor of frames, for antialiasing."""
 PAPER, GROUND, GRID = (255, 255, 255), (238, 240, 242), (214, 218, 222)
+FLOOR, LIMB = "#dfe3e8", 0.045
+"""Colour of the floor and width of lines in metres."""
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Shape of a film.
+
+    Attributes:
+        kind: ``'area'``, a filled polygon; ``'line'`` through the points; ``'dots'``, a disc at each point; ``'way'``, the past
+            path of a single point.
+        points: ``(frame, point, 2)`` in the film's unit, x right and y up; ``(1, point, 2)`` for a still shape. Shapes with a point
+            that is not finite are hidden in this frame.
+        colour: ``#rrggbb``.
+        size: width of a line or radius of a disc in the film's unit; 0 for a hairline, or the outline of an area.
+        filled: whether areas and discs are filled.
+    """
+
+    kind: Kind
+    points: Points
+    colour: str
+    size: float = 0.0
+    filled: bool = True
+
+
+@dataclass(frozen=True)
+class VectorFilm:
+    """Film of a plan or episode.
+
+    Attributes:
+        shapes: shapes in drawing order; moving shapes have the same number of frames.
+        window: visible window: left edge, lower edge, width and height, in the film's unit.
+        rate: frames per second. Points are interpolated linearly between frames.
+    """
+
+    shapes: Sequence[Shape]
+    window: tuple[float, float, float, float]
+    rate: float
+
+    @property
+    def frames(self) -> int:
+        """Number of frames."""
+        return max((len(shape.points) for shape in self.shapes), default=0)
 
 
 @dataclass(frozen=True)
@@ -42,6 +89,34 @@ class Wireframe:
     heads: tuple[tuple[int, float, str], ...] = ()
     rate: float = 30.0
     room: tuple[float, float] = (0.75, 2.1)
+
+
+def still(kind: Kind, points: Sequence[Sequence[float]] | NDArray[np.floating], colour: str, size: float = 0.0) -> Shape:
+    """Still shape from points ``(point, 2)``."""
+    return Shape(kind, np.asarray(points, dtype=np.float32)[None], colour, size)
+
+
+def regular(corners: int, radius: float, turn: float = 0.0) -> Points:
+    """Regular polygon ``(corners, 2)`` around the origin, with a corner at the angle ``turn`` in radians."""
+    angle = turn + np.arange(corners) * 2 * math.pi / corners
+    return (radius * np.stack((np.cos(angle), np.sin(angle)), axis=-1)).astype(np.float32)
+
+
+def some(count: int, most: int) -> NDArray[np.int64]:
+    """At most ``most`` evenly spaced frames, including the first and last."""
+    return np.unique(np.linspace(0, max(count - 1, 0), min(count, most)).round().astype(np.int64))
+
+
+def of_wireframe(wireframe: Wireframe) -> VectorFilm:
+    """Vector film of a wireframe, with its floor."""
+    at = seen(wireframe.points)[..., :2]
+    left, lower, side = window([wireframe])
+    shapes = [still("area", seen(disc(wireframe.room[0]))[:, :2], FLOOR)]
+    shapes += [
+        Shape("line", at[:, list(pair)], colour, LIMB) for pair, colour in zip(wireframe.lines, wireframe.colours, strict=True)
+    ]
+    shapes += [Shape("dots", at[:, [point]], colour, radius) for point, radius, colour in wireframe.heads]
+    return VectorFilm(shapes, (left, lower, side, side), wireframe.rate)
 
 
 def seen(points: Points) -> Points:
@@ -107,11 +182,11 @@ def drawn(wireframe: Wireframe, size: int = SIZE) -> list[NDArray[np.uint8]]:
         picture = empty.copy()
         pen = ImageDraw.Draw(picture)
         for a, b in wireframe.lines:
-            _line(pen, shadow[a], shadow[b], GRID, 0.045 * scale)
+            _line(pen, shadow[a], shadow[b], GRID, LIMB * scale)
         depth = [float(frame[a, 2] + frame[b, 2]) for a, b in wireframe.lines]
         for index in np.argsort(depth):  # nearer lines on top
             a, b = wireframe.lines[index]
-            _line(pen, frame[a], frame[b], wireframe.colours[index], 0.045 * scale)
+            _line(pen, frame[a], frame[b], wireframe.colours[index], LIMB * scale)
         for point, radius, colour in wireframe.heads:
             _ball(pen, frame[point], radius * scale, colour)
         pictures.append(np.asarray(picture.resize((size, size), Image.Resampling.BOX), dtype=np.uint8))
