@@ -51,7 +51,7 @@ class AblateOptions:
 
 def ablate(options: AblateOptions) -> None:
     """Run the cells, or print or write what the options ask for instead."""
-    from ftl_lightning.apps.ablation.run import planned, run_ablation, show_cells, show_estimate
+    from ftl_lightning.apps.ablation.run import check, planned, run_ablation, show_cells, show_estimate
 
     stages, seeds, results = options.stages, options.seeds, options.results
     if not (options.estimate or options.status or options.slurm):
@@ -62,7 +62,6 @@ def ablate(options: AblateOptions) -> None:
     if options.status:
         show_cells(results, [cell for cells in plan.values() for cell in cells])
     if options.slurm:
-        from ftl_lightning.apps.ablation.check import check
         from ftl_lightning.apps.ablation.slurm import write_scripts
 
         check([cell for cells in plan.values() for cell in cells])

@@ -101,8 +101,7 @@ def benchmark(options: BenchmarkOptions) -> None:
         write_text(Path(options.leaderboard), leaderboard(submissions))
         say(f"{options.leaderboard}: {counted(len(submissions), 'submission')}")
     elif options.data:
-        from ftl_lightning.apps.benchmark.data import write_data
-        from ftl_lightning.apps.benchmark.suite import load_suite
+        from ftl_lightning.apps.benchmark.suite import load_suite, write_data
 
         for name in _chosen(options):
             written = write_data(load_suite(name), _numbers(options), Path(options.data), options.format, _root(options))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from ftl_lightning.apps.testing.strokes import NEW, TRAINING, strokes
+from ftl_lightning.apps.benchmark.strokes import NEW, TRAINING, strokes
 from ftl_lightning.data.check import check, check_each, mended
 from ftl_lightning.data.container import Demonstrations, concatenate
 from ftl_lightning.data.mended_file import read_mended

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from ftl_lightning.apps.testing.strokes import strokes
+from ftl_lightning.apps.benchmark.strokes import strokes
 from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.igm.prediction import Prediction
 from ftl_lightning.services.errors import UserError

@@ -13,10 +13,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ftl_lightning.apps.ablation.outcome import Attempt, Outcome, Run, Tell
 from ftl_lightning.apps.ablation.plan import Cell
+from ftl_lightning.apps.ablation.record import Attempt, Outcome, Run, Tell
 from ftl_lightning.services import trust
-from ftl_lightning.services.errors import UserError, short
+from ftl_lightning.services.errors import UserError, require, short
 from ftl_lightning.services.tensor_file import alone, write_text
 
 POLL = 0.5
@@ -53,7 +53,7 @@ def cluster(address: str, attempt: Attempt, cells: Sequence[Cell] = ()) -> Itera
     if started:
         _connect(address or os.environ.get("RAY_ADDRESS", ""))
     try:
-        _expect_room(cells)
+        _check_room(cells)
         yield partial(_run, attempt)
     finally:
         if started:
@@ -63,14 +63,13 @@ def cluster(address: str, attempt: Attempt, cells: Sequence[Cell] = ()) -> Itera
 def _connect(address: str) -> None:
     import ray
 
-    if "://" in address:
-        expected = "HOST:PORT of a cluster's head, and ablate called on one of its machines, in a folder that all of them share"
-        raise UserError(f"address: expected {expected}; found {short(address)!r}")
+    expected = "HOST:PORT of a cluster's head, and ablate called on one of its machines, in a folder that all of them share"
+    require("://" not in address, "address", expected, short(address))
     here = _here() if address in ("", "auto") else ""
-    if address == "auto" and not here:
-        raise UserError("address: expected a Ray cluster that this machine is a node of, found none; start it by: ray start")
-    if ":" in address and not _answers(address):
-        raise UserError(f"address: expected the head of a Ray cluster at {short(address)}, found that nothing answers there")
+    expected = "a Ray cluster that this machine is a node of"
+    require(address != "auto" or here, "address", expected, "none; start it by: ray start")
+    expected = f"the head of a Ray cluster at {short(address)}"
+    require(":" not in address or _answers(address), "address", expected, "that nothing answers there")
     os.environ.setdefault("RAY_worker_niceness", "0")  # Ray's default gives workers low priority
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     try:
@@ -166,25 +165,27 @@ def _run(attempt: Attempt, cells: Sequence[Cell], known: set[str], tell: Tell) -
                 )
 
 
-def _expect_room(cells: Sequence[Cell]) -> None:
+def _check_room(cells: Sequence[Cell]) -> None:
     """Refuse cells that fit on no machine of the cluster and would wait for ever.
 
     Raises:
         UserError: naming the first such cell.
     """
-    nodes = [node["Resources"] for node in _nodes()]
+    nodes = _nodes()
     for cell in cells:
-        if not any(cell.resources.fit(node) for node in nodes):
-            raise UserError(
-                f"resources: {cell}: expected a machine with {cell.resources} in the cluster, found none among {len(nodes)}; "
-                "lower them or add a machine"
-            )
+        require(
+            any(cell.resources.fit(node) for node in nodes),
+            f"resources: {cell}",
+            f"a machine with {cell.resources} in the cluster",
+            f"none among {len(nodes)}; lower them or add a machine",
+        )
 
 
 def _nodes() -> list[dict[str, Any]]:
+    """Resources of the cluster's nodes."""
     import ray
 
-    return [node for node in ray.nodes() if node["Alive"]]
+    return [node["Resources"] for node in ray.nodes() if node["Alive"]]
 
 
 def _tell_begun(waiting: Iterable[_Sent], tell: Tell) -> None:
@@ -210,7 +211,7 @@ def _without_home(waiting: dict[Any, _Sent], now: float) -> Iterator[tuple[Cell,
     """Give up cells that have fitted on no machine for :data:`NODE_WAIT`."""
     import ray
 
-    nodes = [node["Resources"] for node in _nodes()]
+    nodes = _nodes()
     for task, sent in list(waiting.items()):
         if sent.node or any(sent.cell.resources.fit(node) for node in nodes):
             sent.homeless = 0.0

@@ -10,15 +10,14 @@ from pathlib import Path
 
 import yaml
 
-from ftl_lightning.apps.ablation.plan import Cell, Stage
-from ftl_lightning.apps.ablation.resources import CPUS, GPUS, MEMORY
+from ftl_lightning.apps.ablation.plan import CPUS, GPUS, MEMORY, Cell, Stage
 from ftl_lightning.services import trust
-from ftl_lightning.services.errors import UserError, shown
+from ftl_lightning.services.errors import UserError, require, shown
 from ftl_lightning.services.tensor_file import write_text
 
 MOST_JOBS = 1000
 """Maximum jobs of an array by Slurm's default."""
-OWN = ("array", "ntasks", "wrap")
+RESERVED = ("array", "ntasks", "wrap")
 """Options of sbatch that the scripts set."""
 _CPUS = "cpus-per-task"
 _OPTION = re.compile(r"[a-z][a-z-]{0,39}")
@@ -95,9 +94,8 @@ def script(wave: Wave, plan: Path, folder: Path, jobs: int = 0, options: Mapping
 
 def _booked(cells: Sequence[Cell]) -> dict[str, str]:
     """Maximum of each resource over the cells, in whole numbers."""
-    if custom := next((cell for cell in cells if cell.resources.custom), None):
-        name = next(iter(custom.resources.custom))
-        raise UserError(f"resources.{name}: expected {CPUS}, {GPUS} or {MEMORY}, which Slurm knows; name others by --sbatch")
+    if custom := [name for cell in cells for name in cell.resources.custom]:
+        raise UserError(f"resources.{custom[0]}: expected {CPUS}, {GPUS} or {MEMORY}, which Slurm knows; name others by --sbatch")
     gpus = math.ceil(max(cell.resources.gpus for cell in cells))
     memory = math.ceil(max(cell.resources.memory_gb for cell in cells) * 1000)
     return ({"gres": f"gpu:{gpus}"} if gpus else {}) | ({"mem": f"{memory}M"} if memory else {})
@@ -105,10 +103,10 @@ def _booked(cells: Sequence[Cell]) -> dict[str, str]:
 
 def _checked(options: Mapping[str, str]) -> dict[str, str]:
     for name, value in options.items():
-        if not _OPTION.fullmatch(name) or name in OWN:
-            raise UserError(f"sbatch: expected options of sbatch without {', '.join(OWN)}, such as partition, found {shown(name)}")
-        if not isinstance(value, str) or not _VALUE.fullmatch(value) or (name == _CPUS and not value.isdigit()):
-            raise UserError(f"sbatch.{name}: expected a value of letters, digits and .,:/@%+=[]*-, found {shown(value)}")
+        allowed = _OPTION.fullmatch(name) and name not in RESERVED
+        require(allowed, "sbatch", f"options of sbatch without {', '.join(RESERVED)}, such as partition", shown(name))
+        readable = isinstance(value, str) and _VALUE.fullmatch(value) and (name != _CPUS or value.isdigit())
+        require(readable, f"sbatch.{name}", "a value of letters, digits and .,:/@%+=[]*-", shown(value))
     return dict(options)
 
 

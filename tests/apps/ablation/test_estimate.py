@@ -4,9 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from ftl_lightning.apps.ablation.estimate import estimate, makespan, seconds_of
 from ftl_lightning.apps.ablation.plan import Cell, Stage
-from ftl_lightning.apps.ablation.record import Entry, read_record, record_path, tell
+from ftl_lightning.apps.ablation.record import Entry, estimate, makespan, read_record, record_path, seconds_of, tell
 from ftl_lightning.cli.main import main
 from ftl_lightning.services.errors import UserError
 from tests.apps.ablation.attempts import nothing_is_run  # noqa: F401
@@ -43,7 +42,7 @@ def test_an_estimate_says_what_it_does_not_know() -> None:
     lines = estimate([[other], plan], {first.name: Entry("done", first.configs, seconds=3600)}, 9)
     assert lines == [
         "9 cells: 4 need not be run, 5 to run",
-        "not known: 1 of them, none like which was measured, such as fit a, seed 0; their time comes on top",
+        "not known: 1 of them, without a similar measured cell, such as fit a, seed 0; their time is added",
         "measured: 1 of them before, 3 estimated from other seeds or options of the same files",
         "1 at a time: 4.0 hours",
         "2 at a time: 2.0 hours",

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from ftl_lightning.apps.benchmark.strokes import strokes
 from ftl_lightning.apps.play.viewer import MOST_SHOWN, holds_results, results_page, viewed
-from ftl_lightning.apps.testing.strokes import strokes
 from ftl_lightning.cli.main import main
 from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.domains.registry import load_domain

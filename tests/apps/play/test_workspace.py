@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 import torch
 
+from ftl_lightning.apps.benchmark.strokes import drawn
 from ftl_lightning.apps.play import requests, workspace
 from ftl_lightning.apps.play.films import Json
 from ftl_lightning.apps.play.same import VARIABLES, Learned
 from ftl_lightning.apps.play.workspace import Stopped, Workspace
-from ftl_lightning.apps.testing.more_strokes import drawn
 from ftl_lightning.cli.main import main
 from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.igm.concept import Concept
