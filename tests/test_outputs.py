@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 from PIL import Image
 
-from ftl_lightning.apps.study.answers import read_key
+from ftl_lightning.apps.study.report import read_key
 from ftl_lightning.cli.main import main
 from ftl_lightning.domains.line_plots import picture
 from ftl_lightning.evaluation.animation import captioned

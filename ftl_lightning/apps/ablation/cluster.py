@@ -1,13 +1,12 @@
 """Run cells on a Ray cluster, placed by their resources; a cell that loses its process or machine runs once more."""
 
-import fcntl
+import itertools
 import os
-import shutil
 import socket
 import tempfile
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -17,7 +16,7 @@ from ftl_lightning.apps.ablation.plan import Cell
 from ftl_lightning.apps.ablation.record import Attempt, Outcome, Run, Tell
 from ftl_lightning.services import trust
 from ftl_lightning.services.errors import UserError, require, short
-from ftl_lightning.services.tensor_file import alone, write_text
+from ftl_lightning.services.tensor_file import write_text
 
 POLL = 0.5
 """Seconds between two checks of the cells."""
@@ -29,7 +28,6 @@ NODE_WAIT = 60.0
 """Maximum seconds that a cell waits for a machine that has left the cluster."""
 MOST_RUNS = 2
 """Maximum runs of a cell, so that a cell that crashes machines does not crash them all."""
-_FOLDER = ".cells."
 
 
 @contextmanager
@@ -124,17 +122,16 @@ def _run(attempt: Attempt, cells: Sequence[Cell], known: set[str], tell: Tell) -
 
     address = ray.get_runtime_context().gcs_address
     remote = ray.remote(max_retries=0)(_attempt_in)  # otherwise Ray silently repeats lost cells
-    with _begun_folder() as folder:
+    with tempfile.TemporaryDirectory(prefix=".cells.", dir=Path.cwd()) as folder:
         waiting: dict[Any, _Sent] = {}
 
         def send(cell: Cell, runs: int) -> None:
-            begun = folder / f"{len(sent)}"
-            sent.append(cell)
+            begun = Path(folder, str(next(numbers)))
             task = remote.options(name=cell.folder, **cell.resources.ray())
-            sent_task = task.remote(str(Path.cwd()), cell, known, trust.vouched(), attempt, str(begun), runs > 1)
-            waiting[sent_task] = _Sent(cell, runs, begun)
+            sent = task.remote(str(Path.cwd()), cell, known, trust.vouched(), attempt, str(begun), runs > 1)
+            waiting[sent] = _Sent(cell, runs, begun)
 
-        sent: list[Cell] = []
+        numbers = itertools.count()
         for cell in cells:
             send(cell, 1)
         looked, silent = time.monotonic(), 0.0
@@ -221,37 +218,6 @@ def _without_home(waiting: dict[Any, _Sent], now: float) -> Iterator[tuple[Cell,
             ray.cancel(task)
             del waiting[task]
             yield sent.cell, Outcome(error=f"no machine of the cluster has {sent.cell.resources} any more")
-
-
-@contextmanager
-def _begun_folder() -> Iterator[Path]:
-    """Create a hidden folder in which cells write their node; folders of killed processes are removed."""
-    with ExitStack() as stack:
-        with alone(Path.cwd()):  # protects new folders until they are locked
-            for left in Path.cwd().glob(f"{_FOLDER}*"):
-                with suppress(OSError), _locked(left):
-                    shutil.rmtree(left)
-            folder = Path(tempfile.mkdtemp(prefix=_FOLDER, dir=Path.cwd()))
-            stack.enter_context(_locked(folder))
-        try:
-            yield folder
-        finally:
-            shutil.rmtree(folder, ignore_errors=True)
-
-
-@contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Lock a folder.
-
-    Raises:
-        OSError: if another process holds the lock.
-    """
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        yield
-    finally:
-        os.close(handle)
 
 
 def _attempt_in(

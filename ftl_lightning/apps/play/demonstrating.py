@@ -1,4 +1,4 @@
-"""Demonstrations of one concept collected on the page: by hand, from the library or from files."""
+"""Demonstrations of a concept collected on the page: by hand, from the library or from files."""
 
 import tempfile
 from dataclasses import replace
@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import Any
 
 from ftl_lightning.apps.play import requests
-from ftl_lightning.apps.play.films import Json, film, films
+from ftl_lightning.apps.play.mixing import Json, film, films
 from ftl_lightning.data.check import check
 from ftl_lightning.data.container import Demonstrations, concatenate
 from ftl_lightning.domains.domain import Source
 from ftl_lightning.domains.recorder import Recorder, Scene, check_path
 from ftl_lightning.few_shot.learner import FewShot
-from ftl_lightning.services.errors import UserError, short
+from ftl_lightning.services.errors import UserError, require, short
 from ftl_lightning.training.demonstration_check import fit_findings
 
 WANTED = 5
@@ -24,7 +24,7 @@ FILES = (".npz", ".safetensors")
 
 
 class Demonstrating:
-    """Demonstrations of one concept, and the scenes in which more can be recorded.
+    """Demonstrations of a concept, and the scenes in which more can be recorded.
 
     Args:
         model: model of the same domain.
@@ -66,13 +66,13 @@ class Demonstrating:
         """Suffixes of readable files."""
         return (*FILES, *self._domain.imports)
 
-    def told(self) -> dict[str, Any]:
+    def report(self) -> dict[str, Any]:
         """Films, findings of the check for each demonstration and for all, and whether a change can be undone."""
         flags: dict[int, list[str]] = {}
         general: list[str] = []
         if self._entries:
             joined = self.together("demonstrations")
-            findings = (*check(joined), *fit_findings(self._model.model, joined))  # the latter runs the model, which takes longer
+            findings = (*check(joined), *fit_findings(self._model.model, joined))
             for finding in (item for item in findings if item.severity != "note"):
                 for row in finding.rows:
                     flags.setdefault(row, []).append(finding.text)
@@ -89,8 +89,7 @@ class Demonstrating:
         Raises:
             UserError: if there are none.
         """
-        if not self._entries:
-            raise UserError("demonstrations: expected one or more, found none; show the model something first")
+        require(self._entries, "demonstrations", "one or more", "none; show the model something first")
         joined = concatenate([entry for _, entry in self._entries])
         return replace(joined, concepts=(name,) * len(joined))
 
@@ -106,8 +105,8 @@ class Demonstrating:
             UserError: in a domain without recording by hand, or for a task without scenes.
         """
         recorder = self._recorder()
-        if asked.task and asked.task not in recorder.tasks:
-            raise UserError(f"task: expected one of {len(recorder.tasks)} whose scenes can be drawn, found {short(asked.task)!r}")
+        expected = f"one of {len(recorder.tasks)} whose scenes can be drawn"
+        require(not asked.task or asked.task in recorder.tasks, "task", expected, short(asked.task))
         self._count += 1
         scene = recorder.scene(asked.task, self._count)
         self.task = asked.task or self.task
@@ -124,8 +123,8 @@ class Demonstrating:
             UserError: for an unknown scene, or a path that shows nothing.
         """
         recorder = self._recorder()
-        if (scene := self._scenes.get(asked.scene)) is None:
-            raise UserError(f"scene: expected one that was asked for, found {asked.scene}; reload the page")
+        require(asked.scene in self._scenes, "scene", "a scene drawn before", f"{asked.scene}; reload the page")
+        scene = self._scenes[asked.scene]
         self.add(recorder.record(scene, *check_path(scene, asked.path, asked.seconds)))
 
     def draw(self, asked: requests.Drawn) -> None:
@@ -156,10 +155,9 @@ class Demonstrating:
             try:
                 imports = self._domain.imports.get(ending)
                 self.add(self._model.demonstrations((imports or Demonstrations.load)(path), name=stem))
-            except UserError as error:  # names a file that the user does not know
-                message = str(error).replace(str(path), short(Path(name).name))
-                message = message if message.startswith(short(Path(name).name)) else f"{short(Path(name).name)}: {message}"
-                raise UserError(message) from error
+            except UserError as error:  # names the temporary file
+                file = short(Path(name).name)
+                raise UserError(f"{file}: {str(error).replace(str(path), file).removeprefix(f'{file}: ')}") from error
 
     def add(self, more: Demonstrations) -> None:
         """Append demonstrations as separate entries.
@@ -167,8 +165,8 @@ class Demonstrating:
         Raises:
             UserError: if there are too many.
         """
-        if len(self._entries) + len(more) > MOST:
-            raise UserError(f"demonstrations: expected at most {MOST} of a concept, found {len(self._entries) + len(more)}")
+        count = len(self._entries) + len(more)
+        require(count <= MOST, "demonstrations", f"at most {MOST} of a concept", count)
         self._keep()
         for row in range(len(more)):
             self._count += 1
@@ -183,8 +181,7 @@ class Demonstrating:
         Raises:
             UserError: if it does not exist.
         """
-        if all(number != asked.id for number, _ in self._entries):
-            raise UserError(f"id: expected a demonstration that is there, found {asked.id}")
+        require(asked.id in {number for number, _ in self._entries}, "id", "an existing demonstration", asked.id)
         self._keep()
         self._entries = [(number, entry) for number, entry in self._entries if number != asked.id]
 
@@ -200,9 +197,9 @@ class Demonstrating:
         self._entries = []
 
 
-def as_npz(own: Demonstrations) -> bytes:
+def as_npz(demonstrations: Demonstrations) -> bytes:
     """Demonstrations as an ``.npz`` file."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "demonstrations.npz"
-        own.save(path)
+        demonstrations.save(path)
         return path.read_bytes()

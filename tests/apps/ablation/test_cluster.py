@@ -228,7 +228,7 @@ def test_resources_are_said_in_the_words_of_ray_and_refused_where_they_cannot_be
         ({"cpus": 1.5}, "resources.cpus: expected a whole number of 0 or more, or a fraction of 1, found 1.5"),
         ({"gpus": -1}, "resources.gpus: expected a whole number"),
         ({"memory_gb": float("nan")}, "resources.memory_gb: expected a number of 0 or more, found nan"),
-        ({"big one": 1}, "resources: expected cpus, gpus, memory_gb or a resource of the cluster's own, found 'big one'"),
+        ({"big one": 1}, "resources: expected cpus, gpus, memory_gb or a custom resource of the cluster, found big one"),
     ):
         with pytest.raises(UserError, match=told.replace("'", "."), check=lambda error: "\n" not in str(error)):
             Resources.read(asked)
