@@ -9,7 +9,7 @@ from ftl_lightning.services.errors import UserError, short
 from ftl_lightning.services.printing import line, say
 
 if TYPE_CHECKING:
-    from ftl_lightning.apps.benchmark.run import Entry
+    from ftl_lightning.apps.benchmark.run import Candidate
     from ftl_lightning.apps.benchmark.submission import Submission
 
 
@@ -77,11 +77,11 @@ def _root(options: BenchmarkOptions) -> Path | None:
     return Path(options.root) if options.root else None
 
 
-def _entry(options: BenchmarkOptions, work: Path) -> "Entry":
+def _entry(options: BenchmarkOptions, work: Path) -> "Candidate":
     """The method to run, with a folder for models and logs."""
-    from ftl_lightning.apps.benchmark.run import Entry
+    from ftl_lightning.apps.benchmark.run import Candidate
 
-    return Entry(options.method, options.model, options.configurations, _root(options), work)
+    return Candidate(options.method, options.model, options.configurations, _root(options), work)
 
 
 def benchmark(options: BenchmarkOptions) -> None:

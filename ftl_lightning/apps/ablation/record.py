@@ -59,7 +59,7 @@ Attempt = Callable[[Cell, set[str], bool], Outcome]
 
 
 @dataclass(frozen=True)
-class Entry:
+class CellRecord:
     """Recorded state of a cell.
 
     Attributes:
@@ -84,7 +84,7 @@ def record_path(results: str | Path) -> Path:
     return Path(results).with_suffix(".cells.json")
 
 
-def read_record(results: str | Path) -> dict[str, Entry]:
+def read_record(results: str | Path) -> dict[str, CellRecord]:
     """Read the entries by cell name; empty if there is no file.
 
     Raises:
@@ -97,27 +97,21 @@ def read_record(results: str | Path) -> dict[str, Entry]:
     with about(path):
         if not isinstance(content, dict) or (content.get("kind"), content.get("format")) != (KIND, FORMAT):
             raise UserError(f"expected {KIND} of format {FORMAT}, found another file; remove it, it holds no results")
-        entries: dict[str, Entry] = check_type(content.get("cells"), dict[str, Entry], "cells")
+        entries: dict[str, CellRecord] = check_type(content.get("cells"), dict[str, CellRecord], "cells")
         return entries
 
 
 def tell(results: str | Path, cells: Sequence[Cell], state: State, node: str = "", note: str = "", seconds: float = 0.0) -> None:
-    """Record a new state of cells. The file is locked against other processes.
+    """Record a new state of cells, with machine, outcome or error, and duration; other processes are locked out.
 
-    Args:
-        results: the results file.
-        cells: the cells.
-        state: the new state.
-        node: the machine; empty to keep the known machine.
-        note: the outcome, the error, or the reason for another run.
-        seconds: duration of a completed run; 0 to keep the known duration.
+    An empty node and 0 seconds keep the known values.
     """
     path = record_path(results)
     with alone(path.parent):
         entries = read_record(results)
         for cell in cells:
-            before = entries.get(cell.name, Entry())
-            entries[cell.name] = Entry(
+            before = entries.get(cell.name, CellRecord())
+            entries[cell.name] = CellRecord(
                 state=state,
                 configs=cell.configs,
                 node=node or ("" if state == "queued" else before.node),
@@ -129,14 +123,9 @@ def tell(results: str | Path, cells: Sequence[Cell], state: State, node: str = "
         write_text(path, json.dumps(content, indent=1, ensure_ascii=False) + "\n")
 
 
-def table(entries: Mapping[str, Entry], cells: Sequence[Cell]) -> Table:
-    """Table of cells with state, machine, runs, seconds, and outcome or error.
-
-    Args:
-        entries: entries of the record.
-        cells: cells of the plan, in order; cells without an entry were never started.
-    """
-    known = {cell.name: entries.get(cell.name, Entry()) for cell in cells}
+def table(entries: Mapping[str, CellRecord], cells: Sequence[Cell]) -> Table:
+    """Table of cells with state, machine, runs, seconds, and outcome or error; cells without an entry were never started."""
+    known = {cell.name: entries.get(cell.name, CellRecord()) for cell in cells}
     shown = Table(title=count_states([entry.state for entry in known.values()]))
     for name in ("cell", "state", "node", "runs", "seconds", "note"):
         shown.add_column(name, justify="right" if name in ("runs", "seconds") else "left")
@@ -154,20 +143,17 @@ def count_states(states: Sequence[str]) -> str:
     return f"{cells}: {', '.join(parts)}" if parts else cells
 
 
-def by_node(entries: Mapping[str, Entry], cells: Sequence[Cell]) -> list[str]:
+def by_node(entries: Mapping[str, CellRecord], cells: Sequence[Cell]) -> list[str]:
     """Counts of cells by state, in a line for each machine."""
     known = [entries[cell.name] for cell in cells if cell.name in entries]
     nodes = sorted({entry.node for entry in known if entry.node})
     return [f"{node}: {count_states([entry.state for entry in known if entry.node == node])}" for node in nodes]
 
 
-def seconds_of(cell: Cell, entries: Mapping[str, Entry]) -> float | None:
-    """Duration of a cell: its measured duration, or else the mean over similar cells.
+def seconds_of(cell: Cell, entries: Mapping[str, CellRecord]) -> float | None:
+    """Measured seconds of a cell, or else the mean over similar cells; ``None`` without measurements.
 
     Similar cells are, in order: the same cell with other seeds; cells of the same configuration files with other options.
-
-    Returns:
-        Seconds; ``None`` without measurements.
     """
     measured = {name: entry for name, entry in entries.items() if entry.seconds}
     if cell.name in measured:
@@ -180,12 +166,7 @@ def seconds_of(cell: Cell, entries: Mapping[str, Entry]) -> float | None:
 
 
 def makespan(seconds: Sequence[Sequence[float]], workers: int) -> float:
-    """Total seconds of consecutive stages, when the next cell goes to the first free worker.
-
-    Args:
-        seconds: durations of the cells of each stage, in order.
-        workers: number of parallel cells.
-    """
+    """Total seconds of consecutive stages, given the durations of their cells, when the next cell goes to the first free worker."""
     total = 0.0
     for stage in seconds:
         free = [0.0] * workers
@@ -195,14 +176,14 @@ def makespan(seconds: Sequence[Sequence[float]], workers: int) -> float:
     return total
 
 
-def estimate(plan: Sequence[Sequence[Cell]], entries: Mapping[str, Entry], total: int, workers: int = 0) -> list[str]:
+def estimate(plan: Sequence[Sequence[Cell]], entries: Mapping[str, CellRecord], total: int, workers: int = 0) -> list[str]:
     """Lines with the number of cells to run and the estimated hours, if known.
 
     Args:
         plan: the cells to run of each stage.
         entries: entries of the record.
         total: number of cells of the whole plan.
-        workers: number of parallel cells; 0 for 1, 2, 4, 8 and so on, up to the number of cells.
+        workers: number of parallel cells; 0 for the powers of two up to the number of cells.
     """
     cells = [cell for stage in plan for cell in stage]
     lines = [f"{total} cells: {total - len(cells)} need not be run, {len(cells)} to run"]

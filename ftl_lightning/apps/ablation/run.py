@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from ftl_lightning.apps.ablation.cluster import cluster
-from ftl_lightning.apps.ablation.plan import Cell, Stage, part
+from ftl_lightning.apps.ablation.plan import Cell, Stage
 from ftl_lightning.apps.ablation.record import (
     Outcome,
     Run,
@@ -92,36 +92,24 @@ def _check(cell: Cell, made: set[str]) -> None:
 
 
 def run_ablation(
-    stages: Sequence[Stage],
-    seeds: Sequence[int],
-    results: str,
-    shard: str = "1/1",
-    executor: Literal["local", "ray"] = "local",
-    root: str = "",
-    address: str = "",
-    only: Sequence[int] = (),
+    plan: Sequence[Sequence[Cell]], results: str, executor: Literal["local", "ray"] = "local", address: str = ""
 ) -> None:
-    """Run all cells of all seeds, stage after stage. A failed cell does not stop the others; failures are listed at the end.
+    """Run all cells, stage after stage. A failed cell does not stop the others; failures are listed at the end.
 
     The state of each cell is recorded beside the results, see :mod:`~ftl_lightning.apps.ablation.record`.
 
     Args:
-        stages: stages in order; a stage may read files of earlier stages.
-        seeds: each stage runs once per seed.
+        plan: cells of each stage, in order; a stage may read files of earlier stages.
         results: results file.
-        shard: ``'3/8'`` for the third of eight parts of the plan, run by different machines or processes.
         executor: ``'local'`` runs cells one by one in this process; ``'ray'`` runs cells in parallel on a cluster whose machines
             share this folder. A cell that loses its process or machine runs once more.
-        root: ``data.root`` of every cell; empty for the value of the configurations.
         address: address of the Ray cluster, see :func:`~ftl_lightning.apps.ablation.cluster.cluster`.
-        only: numbers of the stages to run, from 1; empty for all.
 
     Raises:
         UserError: before the first run, for cells that cannot run; at the end, naming failed cells.
     """
     from ftl_lightning.evaluation.results import add_rows
 
-    plan = part(list(planned(stages, seeds, root, only).values()), shard)
     all_cells = [cell for cells in plan for cell in cells]
     check(all_cells)
     read_record(results)  # fails early if damaged
@@ -162,16 +150,13 @@ def run_ablation(
 
 
 def planned(stages: Sequence[Stage], seeds: Sequence[int], root: str = "", only: Sequence[int] = ()) -> dict[int, list[Cell]]:
-    """The cells of each stage by its number, for all seeds.
+    """The cells of each stage by its number, from 1, for all seeds.
 
     Args:
         stages: stages in order.
         seeds: each stage runs once per seed.
         root: ``data.root`` of every cell; empty for the value of the configurations.
-        only: numbers of the stages, from 1; empty for all.
-
-    Raises:
-        UserError: for no seeds, or an unknown number of a stage.
+        only: numbers of the stages; empty for all.
     """
     require(seeds, "seeds", "one or more", "none")
     for number in only:
@@ -186,16 +171,7 @@ def planned(stages: Sequence[Stage], seeds: Sequence[int], root: str = "", only:
 
 
 def show_estimate(plan: Sequence[Sequence[Cell]], results: str, workers: int = 0) -> None:
-    """Print the number of cells to run and the estimated hours, as far as known; nothing runs.
-
-    Args:
-        plan: the cells of each stage.
-        results: results file.
-        workers: number of parallel cells; 0 for several numbers.
-
-    Raises:
-        UserError: for cells that cannot run.
-    """
+    """Check the cells of each stage; print how many are to run, and the estimated hours for some workers (0: several numbers)."""
     total = sum(map(len, plan))
     check([cell for cells in plan for cell in cells])
     known = known_hashes(results)

@@ -60,17 +60,14 @@ def _reads(cell: Cell, made: set[str]) -> bool:
 
 
 def script(wave: Wave, plan: Path, folder: Path, jobs: int = 0, options: Mapping[str, str] = {}) -> str:
-    """The script of an array, in which each job runs a shard of the cells.
+    """Script of an array, in which each job runs a shard of the cells.
 
     Args:
         wave: a wave of the plan.
         plan: the plan's configuration file.
         folder: working folder of the jobs, shared by all machines.
         jobs: number of jobs; 0 for a job per cell, at most :data:`MOST_JOBS`.
-        options: options of sbatch by name; empty values for flags.
-
-    Raises:
-        UserError: for an option that sbatch could misread, or a resource that Slurm does not know.
+        options: options of sbatch by name; empty values for flags. Options that sbatch could misread are refused.
     """
     jobs = min(jobs or MOST_JOBS, len(wave.cells))
     cpus = math.ceil(max(cell.resources.cpus for cell in wave.cells)) or 1
@@ -125,14 +122,10 @@ def write_scripts(
         stages: stages of the plan.
         plan: the cells of each stage by its number.
         keys: keys of the plan's file beside the stages: results, seeds, root.
-        jobs: number of jobs of each array; 0 for a job per cell.
-        options: options of sbatch.
+        jobs, options: as in :func:`script`.
 
     Returns:
         The submit commands, in order.
-
-    Raises:
-        UserError: as :func:`script`; nothing is written.
     """
     file, folder = Path(file), Path.cwd()
     written = folder / f"{file}.yaml"

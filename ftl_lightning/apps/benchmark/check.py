@@ -5,10 +5,11 @@ Only numbers and known names of suites and concepts are read from a file. No cod
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
-from ftl_lightning.apps.benchmark.run import SHIPPED, Entry, temporary
+from ftl_lightning.apps.benchmark.run import SHIPPED, Candidate
 from ftl_lightning.apps.benchmark.submission import FORMAT, GIVEN, KIND, PRETRAINED, Row, Run, Submission, machine, scored
 from ftl_lightning.apps.benchmark.suite import REQUIRED, SEEDS, TRAINING, BenchmarkSuite, load_suite, suite_names
 from ftl_lightning.services.errors import about, require, short
@@ -34,7 +35,7 @@ def check_submission(path: Path) -> tuple[Submission, dict[str, BenchmarkSuite]]
         The submission, and its suites by name.
 
     Raises:
-        UserError: naming the file and the first error, with expected and actual value.
+        UserError: naming the file and the first error.
     """
     submission = Submission.load(path)
     with about(path):
@@ -126,13 +127,8 @@ def _check_scores(submission: Submission) -> None:
 def drawn(submission: Submission, share: float, salt: str) -> list[Run]:
     """Draw the runs to run again, with at least a share of all rows.
 
-    The draw depends on a hash of the file and a word of the checker: who does not know the word cannot tune a file to a favourable
-    draw.
-
-    Args:
-        submission: the checked submission.
-        share: share of its rows, 0 for none.
-        salt: the word; may be empty.
+    The draw depends on a hash of the file and a word of the checker, ``salt``: who does not know the word cannot tune a file to a
+    favourable draw.
     """
     file_hash = submission.hash
     order = sorted(submission.runs, key=lambda run: content_hash([salt, file_hash, run.suite, run.seed]))
@@ -141,19 +137,6 @@ def drawn(submission: Submission, share: float, salt: str) -> list[Run]:
     while sum(len(run.rows) for run in runs) < least:
         runs.append(order[len(runs)])
     return runs
-
-
-@dataclass(frozen=True)
-class Difference:
-    """A number that was not reproduced."""
-
-    run: Run
-    where: str
-    submitted: object
-    repeated: object
-
-    def __str__(self) -> str:
-        return f"{self.run.suite}, seed {self.run.seed}, {short(self.where, 80)}: submitted {self.submitted}, found {self.repeated}"
 
 
 def allowed(submitted: float, repeated: float, n: int, rate: bool, alike: bool) -> bool:
@@ -175,50 +158,54 @@ def allowed(submitted: float, repeated: float, n: int, rate: bool, alike: bool) 
     return difference <= ERRORS * (2 * mean * (1 - mean) / n) ** 0.5
 
 
-def differences(run: Run, again: Run, suite: BenchmarkSuite, alike: bool) -> Iterator[Difference]:
-    """Differences between a submitted run and the same run here."""
+def differences(run: Run, again: Run, suite: BenchmarkSuite, alike: bool) -> Iterator[str]:
+    """Differences between a submitted run and the same run here, in words."""
+
+    def difference(where: str, submitted: object, repeated: object) -> str:
+        return f"{run.suite}, seed {run.seed}, {short(where, 80)}: submitted {submitted}, found {repeated}"
+
     if alike and run.configuration != again.configuration:
-        yield Difference(run, "configuration", run.configuration, again.configuration)
+        yield difference("configuration", run.configuration, again.configuration)
     if (alike or again.origin == GIVEN) and run.model != again.model:
-        yield Difference(run, "model", run.model, again.model)
-    pairs = [("", run.rows, again.rows), *((name, rows, again.references.get(name, ())) for name, rows in run.references.items())]
-    for name, rows, repeated in pairs:
-        known = {(row.setting, row.concept): row for row in repeated}
+        yield difference("model", run.model, again.model)
+    for name, rows in {"": run.rows, **run.references}.items():
+        repeated_rows = again.references.get(name, ()) if name else again.rows
+        known = {(row.setting, row.concept): row.measures for row in repeated_rows}
         for row in rows:
-            repeat = known.get((row.setting, row.concept))
+            repeated = known.get((row.setting, row.concept), {})
             for measure, value in row.measures.items():
                 where = ", ".join(filter(None, (name, row.concept, measure)))
-                if repeat is None or measure not in repeat.measures:
-                    yield Difference(run, where, value, "none")
-                elif not allowed(value, repeat.measures[measure], row.n, suite.is_rate(measure), alike):
-                    yield Difference(run, where, value, repeat.measures[measure])
+                if measure not in repeated:
+                    yield difference(where, value, "none")
+                elif not allowed(value, repeated[measure], row.n, suite.is_rate(measure), alike):
+                    yield difference(where, value, repeated[measure])
 
 
 def recompute(
-    entry: Entry, submission: Submission, suites: Mapping[str, BenchmarkSuite], share: float, salt: str
-) -> list[Difference]:
+    candidate: Candidate, submission: Submission, suites: Mapping[str, BenchmarkSuite], share: float, salt: str
+) -> list[str]:
     """Run a part of a submission again and return the differences.
 
     Raises:
         UserError: for another method, or one that cannot be run here.
     """
-    method = load_method(entry.method)
+    method = load_method(candidate.method)
     expected = f"{submission.method!r}, the method of the submission"
-    require(method.name == submission.name, "method", expected, repr(entry.method))
-    if submission.code != code_hash(entry.method):
+    require(method.name == submission.name, "method", expected, repr(candidate.method))
+    if submission.code != code_hash(candidate.method):
         say("note: the method's code is not that of the submission", error=True)
     alike = dict(submission.machine) == machine() and submission.version == __version__
     chosen = drawn(submission, share, salt)
-    all_differences: list[Difference] = []
+    all_differences: list[str] = []
     count, total = (sum(len(run.rows) for run in runs) for runs in (chosen, submission.runs))
     say(f"running {len(chosen)} of {len(submission.runs)} runs again, {count} of {total} rows")
     if not alike:
         say("note: another machine or version: rates may differ by three standard errors, as rounding does", error=True)
-    with temporary(entry) as copy:
+    with TemporaryDirectory() as work:
         for run in chosen:
             # Given models default to the shipped models.
-            same_models = replace(copy, model=SHIPPED) if run.origin == GIVEN and not copy.model else copy
-            again = same_models.run(suites[run.suite], run.seed)
+            model = SHIPPED if run.origin == GIVEN and not candidate.model else candidate.model
+            again = replace(candidate, model=model, work=Path(work)).run(suites[run.suite], run.seed)
             found = list(differences(run, again, suites[run.suite], alike))
             say(f"{run.suite}, seed {run.seed}: {f'{len(found)} numbers differ' if found else 'the same'}")
             all_differences += found

@@ -40,15 +40,10 @@ def _number(kind: str) -> int:
 
 
 def pictures(kind: str, count: int, seed: int) -> NDArray[np.float32]:
-    """Pictures of polylines with three to five corners, drawn with a soft pen.
+    """Pictures of polylines with three to five corners, drawn with a soft pen: ``(count, 1, 64)``.
 
-    Args:
-        kind: ``'picture NUMBER'``; the number determines the corners.
-        count: number of pictures.
-        seed: determines slant, size, place and width of each picture.
-
-    Returns:
-        ``(count, 1, 64)``: one state of 8 x 8 grey values from 0 to 16, row by row.
+    A state has 8 x 8 grey values from 0 to 16, row by row. The kind ``'picture NUMBER'`` determines the corners, the seed slant,
+    size, place and width of each picture.
     """
     rng, shape = _rng("pictures", kind, seed), _rng("picture", _number(kind))
     corner = shape.uniform(0.12, 0.88, (int(shape.integers(3, 6)), 2))
@@ -70,15 +65,10 @@ def pictures(kind: str, count: int, seed: int) -> NDArray[np.float32]:
 
 
 def reaches(kind: str, count: int, seed: int) -> NDArray[np.float32]:
-    """Reaches of a hand through three places, with a gripper that closes on the way.
+    """Reaches of a hand through three places, with a gripper that closes on the way: ``(count, 50, 4)``.
 
-    Args:
-        kind: ``'reach NUMBER'``; the number determines the places, and when the gripper closes.
-        count: number of reaches.
-        seed: determines the start of each reach and its deviation from the places.
-
-    Returns:
-        ``(count, 50, 4)``: x, y and z in metres, mostly within 0.6 of the origin, and the opening from 0 to 80 mm.
+    Columns are x, y and z in metres, mostly within 0.6 of the origin, and the opening from 0 to 80 mm. The kind ``'reach NUMBER'``
+    determines the places and when the gripper closes, the seed start and deviations of each reach.
     """
     shape, rng, s, drawn = _rng("a reach", _number(kind)), _rng("reaches", kind, seed), np.linspace(0, 1, 50), []
     goals, closing, height = shape.uniform(-0.4, 0.4, (3, 3)), shape.uniform(0.2, 0.8), shape.uniform(0.05, 0.3)
@@ -95,15 +85,9 @@ def reaches(kind: str, count: int, seed: int) -> NDArray[np.float32]:
 
 
 def beats(kind: str, count: int, seed: int) -> NDArray[np.float32]:
-    """Beats of one column: four waves over a wandering line.
+    """Beats of one column, four waves over a wandering line: ``(count, 120, 1)``, in millivolts, mostly within 3 of zero.
 
-    Args:
-        kind: ``'beat NUMBER'``; the number determines the waves' places, widths and heights.
-        count: number of beats.
-        seed: determines pace, size and wandering of each beat.
-
-    Returns:
-        ``(count, 120, 1)``, in millivolts, mostly within 3 of zero.
+    The kind ``'beat NUMBER'`` determines the waves, the seed pace, size and wandering of each beat.
     """
     shape, rng, s, drawn = _rng("a beat", _number(kind)), _rng("beats", kind, seed), np.linspace(0, 1, 120), []
     place, width, height = np.sort(shape.uniform(0.1, 0.9, 4)), shape.uniform(0.015, 0.08, 4), shape.normal(0, 1, 4)
@@ -156,15 +140,7 @@ def stroke_kinds(samples: NDArray[np.float32]) -> Sequence[str]:
 
 
 def family(name: str, plans: Plans, draw: Draw, kinds: tuple[Sequence[str], Sequence[str], Sequence[str]], judge: Kind) -> Domain:
-    """Domain of a family.
-
-    Args:
-        name: name of the domain.
-        plans: columns and horizon of the behaviour.
-        draw: draws behaviour of a kind.
-        kinds: kinds for training, for validation and for the test.
-        judge: classifies samples by kind.
-    """
+    """Domain of a family, from kinds for training, validation and test; ``judge`` classifies samples by kind."""
     training, validation, test = (tuple(names) for names in kinds)
     all_kinds = (*training, *validation, *test)
 

@@ -1,9 +1,7 @@
 """Run a method through suites: pretraining, learning and evaluation by the cells of ablations."""
 
-import tempfile
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -36,7 +34,7 @@ CONFIGURATIONS = Path(__file__).parent / "configurations"
 
 
 @dataclass(frozen=True)
-class Entry:
+class Candidate:
     """Method with its models and configurations.
 
     Attributes:
@@ -216,7 +214,7 @@ def _rows(suite: BenchmarkSuite, table: "pd.DataFrame", *needed: str) -> list[Ro
     return rows
 
 
-def run_benchmark(entry: Entry, begun: Submission, names: Sequence[str], out: Path) -> Submission:
+def run_benchmark(candidate: Candidate, begun: Submission, names: Sequence[str], out: Path) -> Submission:
     """Run the missing suites and seeds of a submission; the file is written after each run.
 
     Raises:
@@ -228,7 +226,7 @@ def run_benchmark(entry: Entry, begun: Submission, names: Sequence[str], out: Pa
     with bar("cells", len(missing), lines=False) as advance:
         for number, (suite, seed) in enumerate(missing, 1):
             try:
-                run = entry.run(suite, seed)
+                run = candidate.run(suite, seed)
             except UserError as error:  # other suites still run
                 failed.append(str(error))
                 say(f"[{number}/{len(missing)}] failed: {error}")
@@ -241,13 +239,6 @@ def run_benchmark(entry: Entry, begun: Submission, names: Sequence[str], out: Pa
     if failed:
         raise UserError(f"benchmark: {len(failed)} of {len(missing)} runs failed: {failed[0]}")
     return submission
-
-
-@contextmanager
-def temporary(entry: Entry) -> Iterator[Entry]:
-    """The entry with a temporary work folder."""
-    with tempfile.TemporaryDirectory() as folder:
-        yield replace(entry, work=Path(folder))
 
 
 def missing_of(suite: BenchmarkSuite, root: Path | None, method: str = "") -> str:

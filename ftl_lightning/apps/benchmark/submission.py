@@ -152,13 +152,7 @@ def machine() -> dict[str, str]:
 
 
 def score(suite: BenchmarkSuite, rows: Sequence[Sequence[Row]], measure: str = "") -> Score:
-    """Score of a suite.
-
-    Args:
-        suite: the suite.
-        rows: rows of all concepts, by seed.
-        measure: name of a measure; empty for the suite's first.
-    """
+    """Score of a suite from the rows of each seed, for its first measure by default."""
     values: dict[tuple[str, str], list[float]] = {}
     for seed_rows in rows:
         for row in seed_rows:

@@ -169,13 +169,7 @@ class BenchmarkSuite:
         return fingerprints
 
     def drawn(self, part: str, seed: int, root: Path | None) -> Demonstrations:
-        """Draw the demonstrations of a part.
-
-        Args:
-            part: ``training``, ``demonstrations`` of the test's concepts, or ``validation`` for the concepts to tune on.
-            seed: seed of the data.
-            root: folder of the user's copy of the data.
-        """
+        """Demonstrations of a part: of the test's concepts (``demonstrations``), or of :attr:`validation` or :attr:`training`."""
         domain = self.loaded()
         source = domain.source(root)
         if part == TRAINING:
@@ -237,9 +231,6 @@ def write_data(suite: BenchmarkSuite, seeds: Sequence[int], folder: Path, form: 
 
     Returns:
         Written files, without Minari's data sets.
-
-    Raises:
-        UserError: for another format, data that differ from the frozen data, or a folder that cannot be written.
     """
     require(form in FORMATS, "format", f"one of {', '.join(FORMATS)}", form)
     place, known = folder / suite.name, {}

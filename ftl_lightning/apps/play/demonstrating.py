@@ -36,8 +36,8 @@ class Demonstrating:
 
     def __init__(self, model: FewShot, source: Source) -> None:
         self._model, self._domain, self._source = model, model.domain, source
-        self._entries: list[tuple[int, Demonstrations]] = []
-        self._before: list[list[tuple[int, Demonstrations]]] = []
+        self._entries: dict[int, Demonstrations] = {}
+        self._before: list[dict[int, Demonstrations]] = []
         self._scenes: dict[int, Scene] = {}
         self._count = 0
         self._library: Json | None = None
@@ -46,7 +46,7 @@ class Demonstrating:
     @property
     def name(self) -> str:
         """Name of the first demonstration that came with a name; else empty."""
-        return next((entry.concepts[0] for _, entry in self._entries if entry.concepts[0]), "")
+        return next((entry.concepts[0] for entry in self._entries.values() if entry.concepts[0]), "")
 
     @property
     def library(self) -> Json:
@@ -79,18 +79,14 @@ class Demonstrating:
                 general += [] if finding.rows else [finding.text]
         shown = [
             {"id": number, "film": films(self._domain, entry)[0], "flags": flags.get(row, [])}
-            for row, (number, entry) in enumerate(self._entries)
+            for row, (number, entry) in enumerate(self._entries.items())
         ]
         return {"demonstrations": shown, "check": general, "undo": bool(self._before), "wanted": WANTED}
 
     def together(self, name: str) -> Demonstrations:
-        """All demonstrations as those of one concept.
-
-        Raises:
-            UserError: if there are none.
-        """
+        """All demonstrations as those of a concept; at least one is required."""
         require(self._entries, "demonstrations", "one or more", "none; show the model something first")
-        joined = concatenate([entry for _, entry in self._entries])
+        joined = concatenate(list(self._entries.values()))
         return replace(joined, concepts=(name,) * len(joined))
 
     def _recorder(self) -> Recorder:
@@ -98,7 +94,7 @@ class Demonstrating:
             raise UserError(f"scene: expected a model whose behaviour is shown by hand, found one of {self._domain.name}")
         return recorder
 
-    def scene(self, asked: requests.Pose) -> Json:
+    def scene(self, request: requests.Pose) -> Json:
         """Draw a new scene for a demonstration.
 
         Raises:
@@ -106,48 +102,40 @@ class Demonstrating:
         """
         recorder = self._recorder()
         expected = f"one of {len(recorder.tasks)} whose scenes can be drawn"
-        require(not asked.task or asked.task in recorder.tasks, "task", expected, short(asked.task))
+        require(not request.task or request.task in recorder.tasks, "task", expected, short(request.task))
         self._count += 1
-        scene = recorder.scene(asked.task, self._count)
-        self.task = asked.task or self.task
+        scene = recorder.scene(request.task, self._count)
+        self.task = request.task or self.task
         self._scenes[self._count] = scene
         self._scenes = dict(list(self._scenes.items())[-MOST_SCENES:])
         pieces = [{"name": piece.name, "at": list(piece.at), "shapes": list(piece.shapes)} for piece in scene.pieces]
         content = {"film": film(scene.film), "pieces": pieces, "speed": scene.speed, "seconds": scene.seconds}
         return {"scene": self._count, **content}
 
-    def record(self, asked: requests.Recorded) -> None:
+    def record(self, request: requests.Recorded) -> None:
         """Add a demonstration recorded by hand.
 
         Raises:
             UserError: for an unknown scene, or a path that shows nothing.
         """
         recorder = self._recorder()
-        require(asked.scene in self._scenes, "scene", "a scene drawn before", f"{asked.scene}; reload the page")
-        scene = self._scenes[asked.scene]
-        self.add(recorder.record(scene, *check_path(scene, asked.path, asked.seconds)))
+        require(request.scene in self._scenes, "scene", "a scene drawn before", f"{request.scene}; reload the page")
+        scene = self._scenes[request.scene]
+        self.add(recorder.record(scene, *check_path(scene, request.path, request.seconds)))
 
-    def draw(self, asked: requests.Drawn) -> None:
+    def draw(self, request: requests.Drawn) -> None:
         """Add demonstrations of the library: an expert's, or recordings.
 
         Raises:
             UserError: for a task without demonstrations.
         """
-        self._domain.check_goal(asked.task, "task")
+        self._domain.check_goal(request.task, "task")
         self._count += 1
-        self.add(self._source.draw(asked.task, asked.count, self._count))
-        self.task = asked.task
+        self.add(self._source.draw(request.task, request.count, self._count))
+        self.task = request.task
 
     def read(self, name: str, content: bytes) -> None:
-        """Add the demonstrations of a file.
-
-        Args:
-            name: file name, whose suffix determines the program.
-            content: bytes of the file.
-
-        Raises:
-            UserError: for an unknown program, another domain, or a damaged file.
-        """
+        """Add the demonstrations of a file, whose suffix determines the program; damaged files and other domains are refused."""
         ending, stem = Path(name).suffix.lower(), Path(name).stem
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / f"file{ending}"
@@ -160,30 +148,20 @@ class Demonstrating:
                 raise UserError(f"{file}: {str(error).replace(str(path), file).removeprefix(f'{file}: ')}") from error
 
     def add(self, more: Demonstrations) -> None:
-        """Append demonstrations as separate entries.
-
-        Raises:
-            UserError: if there are too many.
-        """
+        """Append demonstrations as separate entries, at most :data:`MOST` in all."""
         count = len(self._entries) + len(more)
         require(count <= MOST, "demonstrations", f"at most {MOST} of a concept", count)
-        self._keep()
-        for row in range(len(more)):
-            self._count += 1
-            self._entries.append((self._count, more.rows([row])))
+        self._change(self._entries | {self._count + row + 1: more.rows([row]) for row in range(len(more))})
+        self._count += len(more)
 
-    def _keep(self) -> None:
-        self._before = [*self._before, list(self._entries)][-MOST_UNDONE:]
+    def _change(self, entries: dict[int, Demonstrations]) -> None:
+        self._before = [*self._before, self._entries][-MOST_UNDONE:]
+        self._entries = entries
 
-    def remove(self, asked: requests.One) -> None:
-        """Remove a demonstration.
-
-        Raises:
-            UserError: if it does not exist.
-        """
-        require(asked.id in {number for number, _ in self._entries}, "id", "an existing demonstration", asked.id)
-        self._keep()
-        self._entries = [(number, entry) for number, entry in self._entries if number != asked.id]
+    def remove(self, request: requests.One) -> None:
+        """Remove an existing demonstration."""
+        require(request.id in self._entries, "id", "an existing demonstration", request.id)
+        self._change({number: entry for number, entry in self._entries.items() if number != request.id})
 
     def undo(self) -> None:
         """Undo the last change."""
@@ -193,8 +171,7 @@ class Demonstrating:
     def clear(self) -> None:
         """Remove all demonstrations."""
         if self._entries:
-            self._keep()
-        self._entries = []
+            self._change({})
 
 
 def as_npz(demonstrations: Demonstrations) -> bytes:

@@ -139,27 +139,14 @@ def samples(model: FewShot, mixture: Mixture, asked: Sample, tasks: Sequence[str
 
 
 def film(drawn: VectorFilm, right: bool | None = None, outcome: str = "") -> Json:
-    """Film of shapes.
-
-    Args:
-        drawn: shapes of the film.
-        right: whether the behaviour is correct; ``None`` if not judged.
-        outcome: outcome in words.
-    """
+    """Film of shapes; ``right`` is ``None`` if not judged."""
     window = [round(edge, 4) for edge in drawn.window]
     shown = {"frames": drawn.frames, "rate": round(drawn.rate, 3), "window": window, "shapes": packed(drawn)}
     return {**shown, "right": right, "told": outcome}
 
 
 def plan_film(show: Show, states: Tensor, starts: InitialStates | None, right: bool | None = None) -> Json:
-    """Film of a plan or demonstration.
-
-    Args:
-        show: the domain's pictures.
-        states: ``(time, state)``, finite.
-        starts: a single initial state; ``None`` in domains without initial states.
-        right: whether the plan is correct; ``None`` if not judged.
-    """
+    """Film of a plan or demonstration ``(time, state)``, with a single initial state in domains that have any."""
     if show.wireframe is not None:
         body = show.wireframe(states)
         return {"space": packed_space(body), "frames": len(body.points), "rate": body.rate, "right": right, "told": ""}
@@ -182,13 +169,7 @@ def films(domain: Domain, plans: Demonstrations, right: Sequence[bool] | None = 
 
 
 def episode_films(domain: Domain, rollout: Rollout, outcomes: Mapping[str, Tensor]) -> list[Json]:
-    """Films of executed episodes; empty in domains that do not draw them.
-
-    Args:
-        domain: domain with an environment.
-        rollout: executed episodes.
-        outcomes: of each episode by name, of bool or numbers ``(episode,)``; empty if not judged.
-    """
+    """Films of executed episodes with their outcomes ``(episode,)`` by name; empty in domains that do not draw them."""
     draw = None if domain.closed_loop is None else domain.closed_loop.vector_film
     if draw is None:
         return []

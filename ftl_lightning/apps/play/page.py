@@ -90,15 +90,10 @@ def _whole(value: Any) -> Any:
 
 
 def pairs_of(concepts: Sequence[dict[str, Any]], named: Sequence[tuple[str, str]] = ()) -> list[tuple[str, str]]:
-    """Pairs of concepts to mix, by their identifiers on the page: learned concepts with training concepts and with each other, or
-    training concepts if none are learned.
+    """Pairs of concepts to mix, by their identifiers on the page.
 
-    Args:
-        concepts: list of concepts of a workspace.
-        named: pairs of concept names that replace the default pairs.
-
-    Raises:
-        UserError: for an unknown name.
+    Without named pairs, learned concepts are mixed with training concepts and with each other; if none are learned, training
+    concepts are mixed.
     """
     if named:
         by_name = {concept["name"]: concept["id"] for concept in concepts}
@@ -117,13 +112,7 @@ def pairs_of(concepts: Sequence[dict[str, Any]], named: Sequence[tuple[str, str]
 def answers_of(
     workspace: Workspace, pairs: Sequence[tuple[str, str]] = (), tell: Callable[[], None] = lambda: None
 ) -> dict[str, Any]:
-    """Answers to all requests of the page, by request key.
-
-    Args:
-        workspace: workspace with the demonstrations and concepts to show.
-        pairs: pairs of concept names; by default see :func:`pairs_of`.
-        tell: called after each mixture.
-    """
+    """Answers to all requests of the page by request key, see :func:`pairs_of`; ``tell`` is called after each mixture."""
     state = workspace.state()
     mixes = pairs_of(state["concepts"], pairs)
     shown = set(itertools.chain(*mixes))
@@ -145,17 +134,7 @@ def answers_of(
 def write_offline(
     workspace: Workspace, path: Path, pairs: Sequence[tuple[str, str]] = (), tell: Callable[[], None] = lambda: None
 ) -> int:
-    """Write the page; the same samples give the same bytes.
-
-    Args:
-        workspace: workspace with the demonstrations and concepts to show.
-        path: path of the HTML file.
-        pairs: as in :func:`answers_of`.
-        tell: called after each mixture.
-
-    Returns:
-        Size of the page in bytes.
-    """
+    """Write the HTML file with :func:`answers_of`, and return its size in bytes; the same samples give the same bytes."""
     content = json.dumps(answers_of(workspace, pairs, tell), separators=(",", ":")).encode()
     text = page(bytes_hash(content), gzip.compress(content, mtime=0))
     write_text(path, text)

@@ -4,7 +4,6 @@ import asyncio
 import contextlib
 import hmac
 import ipaddress
-import json
 import secrets
 import socket
 import webbrowser
@@ -12,10 +11,10 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequenc
 from dataclasses import dataclass
 from types import FrameType
 from typing import Any
-from urllib.parse import parse_qs
 
 import uvicorn
 from starlette.applications import Starlette
+from starlette.datastructures import MutableHeaders
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, Response
@@ -43,31 +42,13 @@ HEADERS: Mapping[str, str] = {
     "x-frame-options": "DENY",
 }
 """Headers of every answer."""
-MISTAKES = (
-    UserError,
-    ArithmeticError,
-    AssertionError,
-    AttributeError,
-    LookupError,
-    MemoryError,
-    OSError,
-    RuntimeError,
-    TypeError,
-    ValueError,
-)
-"""Exceptions that are reported in one line; the server continues."""
 Begin = Callable[[], Awaitable[Any]]
 """Called at the start, while requests are already answered."""
 
 
 class Guard:
     """Refuse requests that are not from the page: with other host names (which a name server may point here), from pages of other
-    origins, or without the token.
-
-    Args:
-        app: answers the accepted requests.
-        token: token of this run.
-        hosts: ``host:port`` that requests may name.
+    origins, or without the token of this run.
     """
 
     def __init__(self, app: ASGIApp, token: str, hosts: frozenset[str]) -> None:
@@ -83,32 +64,23 @@ class Guard:
 
         async def with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
-                extra = [(name.encode(), value.encode()) for name, value in HEADERS.items()]
-                message = {**message, "headers": [*message["headers"], *extra]}
+                MutableHeaders(scope=message).update(HEADERS)
             await send(message)
 
-        if (refusal := self._refusal(scope)) is None:
-            await self._app(scope, receive, with_headers)
-            return
-        body = json.dumps({"error": refusal}).encode()
-        headers = [(b"content-type", b"application/json"), (b"content-length", str(len(body)).encode()), (b"connection", b"close")]
-        await with_headers({"type": "http.response.start", "status": 403, "headers": headers})
-        await send({"type": "http.response.body", "body": body})
+        refusal = self._refusal(Request(scope))
+        answer = self._app if refusal is None else JSONResponse({"error": refusal}, 403, {"connection": "close"})
+        await answer(scope, receive, with_headers)
 
-    def _refusal(self, scope: Scope) -> str | None:
+    def _refusal(self, request: Request) -> str | None:
         """Reason for refusing a request; ``None`` if it is accepted."""
-        headers: dict[str, list[str]] = {}
-        for name, value in scope["headers"]:
-            headers.setdefault(name.decode("latin-1").lower(), []).append(value.decode("latin-1"))
-        if len(host := headers.get("host", [])) != 1 or host[0].lower() not in self._hosts:
+        host = request.headers.getlist("host")
+        if len(host) != 1 or host[0].lower() not in self._hosts:
             return f"host: expected {min(self._hosts)}, found {short(', '.join(host)) or 'none'}"
-        for origin in headers.get("origin", []):
+        for origin in request.headers.getlist("origin"):
             if origin.lower().removeprefix("http://") not in self._hosts:
                 return f"origin: expected http://{min(self._hosts)}, found {short(origin)}"
-        if scope["path"] == "/":
-            given = parse_qs(scope["query_string"].decode("latin-1")).get("token", [])
-        else:
-            given = headers.get(TOKEN, [])
+        first = request.scope["path"] == "/"
+        given = request.query_params.getlist("token") if first else request.headers.getlist(TOKEN)
         if len(given) != 1 or not hmac.compare_digest(given[0].encode(), self._token.encode()):
             return "token: expected that of the address which the program printed, found another; open that address"
         return None
@@ -160,7 +132,8 @@ def guarded(
         if beginning is not None:
             beginning.cancel()
 
-    handlers: Any = {HTTPException: _refused, **dict.fromkeys(MISTAKES, _mistaken)}
+    # Starlette handles errors of class Exception outside of the guard, which adds headers.
+    handlers: Any = {HTTPException: _refused, BaseException: _mistaken}
     all_routes = [*routes, Route("/api/end", ended, methods=["POST"])]
     application = Starlette(routes=all_routes, exception_handlers=handlers, lifespan=lifespan)
     application.add_middleware(Guard, token=token, hosts=frozenset(hosts))
@@ -208,13 +181,7 @@ def serve(
     begin: Begin | None = None,
     close: Callable[[], None] = lambda: None,
 ) -> None:
-    """Serve a page until Ctrl-C, or until the page ends the program.
-
-    Args:
-        routes: routes of the page.
-        place: address of the page.
-        begin: run at the start, while requests are already answered.
-        close: called when the program ends.
+    """Serve a page until Ctrl-C, or until the page ends the program; ``close`` is called at the end.
 
     Raises:
         UserError: if the address is not available.

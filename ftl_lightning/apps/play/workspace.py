@@ -70,11 +70,13 @@ class Known:
     accuracy: float | None = None
 
     @property
-    def form(self) -> str:
-        """Form of the concept in a word or two; empty for training concepts."""
-        if self.concept is None:
-            return ""
-        return self.concept.choice.form if self.concept.choice else "modes" if self.concept.modes else "one set"
+    def content(self) -> Json:
+        """Content for the page's list of concepts; the form is empty for training concepts."""
+        content: Json = {"name": self.name, "kind": self.kind, "count": None, "form": "", "accuracy": self.accuracy}
+        if (concept := self.concept) is not None:
+            content["count"] = concept.origin.count
+            content["form"] = concept.choice.form if concept.choice else "modes" if concept.modes else "one set"
+        return content
 
 
 class Workspace:
@@ -83,9 +85,6 @@ class Workspace:
     Args:
         model: name of a shipped model, or a folder.
         root: folder of the user's copy of recordings, for domains whose demonstrations do not ship.
-
-    Raises:
-        UserError: if the model does not exist, or cannot learn concepts.
     """
 
     def __init__(self, model: str, root: Path | None = None) -> None:
@@ -133,34 +132,34 @@ class Workspace:
         """Suggested name of the concept: the name of the demonstrations, if a file or the library gave it."""
         return self._demonstrating.name or "new concept"
 
-    # Demonstrations.
+    # Demonstrations: each change returns the new work.
 
-    def scene(self, asked: requests.Pose) -> Json:
+    def scene(self, request: requests.Pose) -> Json:
         """Draw a new scene for a demonstration."""
-        return self._demonstrating.scene(asked)
+        return self._demonstrating.scene(request)
 
-    def record(self, asked: requests.Recorded) -> Json:
-        """Add a demonstration recorded by hand; return the new work."""
-        self._demonstrating.record(asked)
+    def record(self, request: requests.Recorded) -> Json:
+        """Add a demonstration recorded by hand."""
+        self._demonstrating.record(request)
         return self.work()
 
-    def draw(self, asked: requests.Drawn) -> Json:
-        """Add demonstrations of the library; return the new work."""
-        self._demonstrating.draw(asked)
+    def draw(self, request: requests.Drawn) -> Json:
+        """Add demonstrations of the library."""
+        self._demonstrating.draw(request)
         return self.work()
 
-    def remove(self, asked: requests.One) -> Json:
-        """Remove a demonstration; return the new work."""
-        self._demonstrating.remove(asked)
+    def remove(self, request: requests.One) -> Json:
+        """Remove a demonstration."""
+        self._demonstrating.remove(request)
         return self.work()
 
-    def undo(self, asked: requests.Nothing) -> Json:
-        """Undo the last change; return the new work."""
+    def undo(self, request: requests.Nothing) -> Json:
+        """Undo the last change."""
         self._demonstrating.undo()
         return self.work()
 
-    def clear(self, asked: requests.Nothing) -> Json:
-        """Remove all demonstrations; return the new work."""
+    def clear(self, request: requests.Nothing) -> Json:
+        """Remove all demonstrations."""
         self._demonstrating.clear()
         return self.work()
 
@@ -203,12 +202,8 @@ class Workspace:
         return known
 
     def _listed(self) -> list[Json]:
-        return [self._entry(key, known) for key, known in self._concepts.items()]
-
-    def _entry(self, key: str, known: Known) -> Json:
-        count = None if known.concept is None else known.concept.origin.count
-        entry = {"id": key, "name": known.name, "kind": known.kind, "count": count, "form": known.form}
-        return entry | {"accuracy": known.accuracy, "hash": self._model.model.hash}
+        model_hash = self._model.model.hash
+        return [{"id": key, **known.content, "hash": model_hash} for key, known in self._concepts.items()]
 
     def _open(self, name: str, content: bytes) -> None:
         with tempfile.TemporaryDirectory() as folder:
@@ -223,11 +218,7 @@ class Workspace:
         self._concepts[f"o{self._count}"] = Known(concept.concept.origin.name, "opened", concept, concept.concept, name)
 
     def concept_file(self, key: str) -> tuple[str, bytes]:
-        """Name and bytes of a concept's file.
-
-        Raises:
-            UserError: for a training concept, which is part of the model.
-        """
+        """Name and bytes of a concept's file; training concepts have none and are refused."""
         known = self._known(key)
         if known.concept is None:
             raise UserError(f"id: expected a learned concept, found the training concept {short(known.name)!r}")
@@ -236,44 +227,31 @@ class Workspace:
             known.concept.save(path)
             return known.learned.file if known.learned else Path(known.file).name, path.read_bytes()
 
-    def forget(self, asked: requests.Named) -> None:
-        """Remove a concept that was learned or opened here.
+    def forget(self, request: requests.Named) -> None:
+        """Remove a concept that was learned or opened here; concepts of the model are refused."""
+        self._editable(request.id)
+        del self._concepts[request.id]
 
-        Raises:
-            UserError: for a concept of the model.
-        """
-        self._editable(asked.id)
-        del self._concepts[asked.id]
-
-    def rename(self, asked: requests.Renamed) -> None:
-        """Rename a concept that was learned or opened here, also in its file.
-
-        Raises:
-            UserError: for a concept of the model.
-        """
-        known, name = self._editable(asked.id), " ".join(asked.name.split())
+    def rename(self, request: requests.Renamed) -> None:
+        """Rename a concept that was learned or opened here, also in its file; concepts of the model are refused."""
+        known, name = self._editable(request.id), " ".join(request.name.split())
         if name == known.name or known.concept is None:
             return
         concept = replace(known.concept, origin=replace(known.concept.origin, name=name))
         learned = known.learned and replace(known.learned, label=self._unused(name))
         self._newest = learned if self._newest is known.learned else self._newest
-        self._concepts[asked.id] = replace(known, name=name, concept=concept, learned=learned)
+        self._concepts[request.id] = replace(known, name=name, concept=concept, learned=learned)
 
-    def learn(self, asked: requests.Learn, tell: Tell, stopped: Callable[[], bool]) -> None:
-        """Learn a concept from the demonstrations, and report loss and samples meanwhile.
-
-        Args:
-            asked: name and settings.
-            tell: called with each line for the page.
-            stopped: whether no client waits any more.
+    def learn(self, request: requests.Learn, tell: Tell, stopped: Callable[[], bool]) -> None:
+        """Learn a concept from the demonstrations, and report loss and samples meanwhile by ``tell``.
 
         Raises:
             UserError: without demonstrations, or if they cannot be learned from.
             Stopped: if no client waits.
         """
-        name = " ".join(asked.name.split())
+        name = " ".join(request.name.split())
         demonstrations, begin = self._demonstrating.together(name), monotonic()
-        changes, steps = self._settings(asked.quick)
+        changes, steps = self._settings(request.quick)
         due, reported = begin + FIRST, begin
 
         def watch(now: Learning) -> None:
@@ -301,9 +279,10 @@ class Workspace:
             measured = concept.quality.quality
             quality = {"line": ", ".join(filter(None, (right, measured.words))), "numbers": measured.numbers}
         decided = [film["right"] for film in shown if film["right"] is not None]
-        self._concepts[key] = known = replace(known, accuracy=sum(decided) / len(decided) if decided else None)
+        self._concepts[key] = replace(known, accuracy=sum(decided) / len(decided) if decided else None)
         self._newest = learned
-        result = {"done": True, "concept": self._entry(key, known), "concepts": self._listed(), "quality": quality}
+        concepts = self._listed()
+        result = {"done": True, "concept": concepts[-1], "concepts": concepts, "quality": quality}
         same = self._same((Part(learned.label, learned=learned),), None)
         tell({**result, "samples": shown[:SHOWN], "seconds": round(seconds, 2), "same": same})
 
@@ -326,31 +305,25 @@ class Workspace:
 
     # Samples.
 
-    def sample(self, asked: requests.Sample) -> Json:
+    def sample(self, request: requests.Sample) -> Json:
         """Generate samples of a mixture.
 
         Raises:
             UserError: for an unknown concept or group, or if behaviour cannot be executed.
         """
         begin = monotonic()
-        known = [self._known(part.id) for part in asked.parts]
+        known = [self._known(part.id) for part in request.parts]
         width, plans = self._model.model.config.state_dim, self._domain.plans
-        concepts = [
-            (part.weight * item.composition).on(plans.grouped(part.groups), width)
-            if part.groups
-            else part.weight * item.composition
-            for part, item in zip(asked.parts, known, strict=True)
-        ]
+        concepts, parts, examples = [], [], []
+        for part, item in zip(request.parts, known, strict=True):
+            weighted = part.weight * item.composition
+            concepts.append(weighted.on(plans.grouped(part.groups), width) if part.groups else weighted)
+            parts.append(Part(item.name, part.weight, tuple(part.groups), item.learned, item.file))
+            if (shown_here := item.demonstrations) is not None:
+                examples.append(replace(shown_here, concepts=(item.name,) * len(shown_here)))
         names = [item.name for item in known]
-        examples = [
-            replace(item.demonstrations, concepts=(item.name,) * len(item.demonstrations)) for item in known if item.demonstrations
-        ]
         mixture = Mixture(concepts, names, examples)
-        shown, verdict, how = samples(self._model, mixture, asked, (self._demonstrating.task, *names))
-        parts = [
-            Part(item.name, part.weight, tuple(part.groups), item.learned, item.file)
-            for part, item in zip(asked.parts, known, strict=True)
-        ]
+        shown, verdict, how = samples(self._model, mixture, request, (self._demonstrating.task, *names))
         return {"samples": shown, "told": verdict, "seconds": round(monotonic() - begin, 3), "same": self._same(parts, how)}
 
     def _samples(self, concept: LearnedConcept, count: int, demonstrations: Demonstrations) -> tuple[list[Json], str]:

@@ -38,13 +38,7 @@ MILLIMETRES = 1000
 
 @dataclass(frozen=True)
 class Made:
-    """Result of :func:`make_study`.
-
-    Attributes:
-        page, key: paths of the files.
-        study: 16-digit identifier of the study.
-        size: bytes of the page; films: number of films; questions: number of questions for a rater.
-    """
+    """Paths and 16-digit identifier of a study, bytes of its page, and numbers of films and of questions for a rater."""
 
     page: Path
     key: Path

@@ -33,7 +33,7 @@ INSTRUCTIONS = {YES: "This question checks attention: please answer Yes.", NO: "
 
 
 @dataclass(frozen=True)
-class Entry:
+class ListedFilm:
     """Film of a listing; an empty text or ``None`` for a default."""
 
     concept: str
@@ -128,19 +128,19 @@ def read_films(folder: Path, domain: Domain, scenarios: int, seed: int) -> list[
     return films
 
 
-def _named(folder: Path) -> list[Entry]:
+def _named(folder: Path) -> list[ListedFilm]:
     """Entries of the files in the folders of methods."""
     paths = visible(folder, "*/*.safetensors")
     require(paths, str(folder), f"{LISTING} or files METHOD/CONCEPT.safetensors", "neither; make them with: sample --out")
-    return [Entry("", path.parent.name, str(path.relative_to(folder))) for path in paths]
+    return [ListedFilm("", path.parent.name, str(path.relative_to(folder))) for path in paths]
 
 
-def _listed(path: Path) -> list[Entry]:
+def _listed(path: Path) -> list[ListedFilm]:
     """Entries of a listing."""
     content = read_json(path)
     with about(path):
         require(isinstance(content, list) and content, "films", "a list with one or more films", content)
-        return [from_mapping(Entry, entry, f"films[{number}]") for number, entry in enumerate(content)]
+        return [from_mapping(ListedFilm, entry, f"films[{number}]") for number, entry in enumerate(content)]
 
 
 def _concept_of(file: str, source: Demonstrations) -> str:
@@ -197,17 +197,13 @@ def film_id(number: int) -> str:
 
 
 def ask(films: Sequence[Film], repeats: int, still: int, seed: int) -> Questions:
-    """The questions about some films.
+    """Ask whether each film depicts its concept, which film of a scenario depicts it best, and checks.
 
     Args:
         films: one film of each method in every scenario, and checks.
         repeats: number of questions that are asked twice.
         still: number of films that are repeated as a standing picture, which depicts no motion.
         seed: random seed of the numbers, and of the repeated and standing films.
-
-    Returns:
-        Whether each film depicts its concept; two questions that state their answer, and the other checks; which film depicts a
-        scenario's concept best.
     """
     rng = np.random.default_rng(seed)
     real = [film for film in films if film.method not in CHECKS]

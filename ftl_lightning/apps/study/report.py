@@ -89,13 +89,7 @@ class Key:
 
 @dataclass(frozen=True)
 class Rater:
-    """Answers of a person.
-
-    Attributes:
-        file: source of the answers.
-        name: 16 digits drawn by the browser.
-        answers: by question id: ``'yes'``, ``'no'``, or a film's id.
-    """
+    """Answers of a person by question id: ``'yes'``, ``'no'``, or a film's id; the name is 16 digits drawn by the browser."""
 
     file: Path
     name: str
@@ -159,15 +153,7 @@ def read_rater(path: Path, key: Key) -> Rater:
 
 
 def read_raters(paths: Sequence[Path], key: Key) -> tuple[list[Rater], list[str]]:
-    """Read files of answers; invalid files are reported and skipped.
-
-    Args:
-        paths: files, or folders with files ``answers*.json``.
-        key: key of the study.
-
-    Returns:
-        Unique raters, and one line for each refused file.
-    """
+    """Read files, or folders with files ``answers*.json``: unique raters, and one line for each refused file."""
     files: list[Path] = []
     refused: list[str] = []
     for path in paths:
@@ -205,14 +191,12 @@ def inattention(rater: Rater, key: Key) -> str:
 
 
 def krippendorff_alpha(units: Iterable[Sequence[Hashable]]) -> float:
-    """Krippendorff's alpha of categories without an order.
+    """Krippendorff's alpha of categories without an order: 1 for full agreement, 0 for agreement by chance, negative for less.
 
-    ``1 - D_observed / D_expected``: 1 for full agreement, 0 for agreement by chance, negative for less. (K. Krippendorff,
-    "Computing Krippendorff's Alpha-Reliability", 2011, part C and D.)
+    ``1 - D_observed / D_expected``, see K. Krippendorff, "Computing Krippendorff's Alpha-Reliability", 2011, part C and D.
 
     Args:
-        units: for each rated item, the categories given by raters, in any order; missing ratings are omitted, and items with fewer
-            than two ratings do not count.
+        units: for each item, the categories given by raters, in any order; items with fewer than two ratings do not count.
 
     Returns:
         alpha, or NaN if nothing varies, because agreement is then indistinguishable from habit.
