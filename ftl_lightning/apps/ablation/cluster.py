@@ -122,7 +122,7 @@ def _run(attempt: Attempt, cells: Sequence[Cell], known: set[str], tell: Tell) -
 
     address = ray.get_runtime_context().gcs_address
     remote = ray.remote(max_retries=0)(_attempt_in)  # otherwise Ray silently repeats lost cells
-    with tempfile.TemporaryDirectory(prefix=".cells.", dir=Path.cwd()) as folder:
+    with tempfile.TemporaryDirectory(prefix=".cells.", dir=Path.cwd(), ignore_cleanup_errors=True) as folder:
         waiting: dict[Any, _Sent] = {}
 
         def send(cell: Cell, runs: int) -> None:

@@ -133,13 +133,17 @@ def playing(desk: Desk) -> list[Route]:
         return JSONResponse(await desk.work(lambda _: desk.open(body.model)))
 
     async def thumbnail(request: Request) -> Response:
-        return JSONResponse(await desk.work(lambda workspace: workspace.thumbnail(_id(request))))
+        key = request.query_params.get("id", "")
+        return JSONResponse(await desk.work(lambda workspace: workspace.thumbnail(key)))
 
-    async def concept(request: Request) -> Response:
-        return _attached(*await desk.work(lambda workspace: workspace.concept_file(_id(request))))
+    def downloading(name: str, do: Callable[[Workspace, str], tuple[str, bytes]]) -> Route:
+        async def download(request: Request) -> Response:
+            key = request.query_params.get("id", "")
+            file, content = await desk.work(lambda workspace: do(workspace, key))
+            headers = {"content-disposition": f"attachment; filename*=UTF-8''{quote(file, safe='')}"}
+            return Response(content, media_type="application/octet-stream", headers=headers)
 
-    async def demonstrations(request: Request) -> Response:
-        return _attached(*await desk.work(lambda workspace: workspace.demonstrations_file(_id(request))))
+        return Route(f"/api/{name}", download)
 
     async def upload(request: Request) -> Response:
         name, content = request.query_params.get("name", ""), await body_of(request, MOST_FILE)
@@ -162,8 +166,8 @@ def playing(desk: Desk) -> list[Route]:
         Route("/", first_page),
         Route("/api/state", state),
         Route("/api/thumbnail", thumbnail),
-        Route("/api/concept", concept),
-        Route("/api/demonstrations", demonstrations),
+        downloading("concept", Workspace.concept_file),
+        downloading("demonstrations", Workspace.demonstrations_file),
         *(answering(name, *handler) for name, handler in {**ANSWERS, **CHANGES}.items()),
         Route("/api/open", opened, methods=["POST"]),
         Route("/api/upload", upload, methods=["POST"]),
@@ -171,17 +175,8 @@ def playing(desk: Desk) -> list[Route]:
     ]
 
 
-def _id(request: Request) -> str:
-    return request.query_params.get("id", "")
-
-
 async def _body(request: Request) -> Any:
     return parse_json(await body_of(request, MOST_BODY), "a question in JSON")
-
-
-def _attached(name: str, content: bytes) -> Response:
-    disposition = f"attachment; filename*=UTF-8''{quote(name, safe='')}"
-    return Response(content, media_type="application/octet-stream", headers={"content-disposition": disposition})
 
 
 async def _learned(desk: Desk, request: Request, body: requests.Learn) -> AsyncIterator[str]:

@@ -241,19 +241,12 @@ def _listening(host: str, port: int) -> socket.socket:
         family = socket.AF_INET6 if ipaddress.ip_address(host).version == 6 else socket.AF_INET
     except ValueError as error:
         raise UserError(f"host: expected an address such as {LOOPBACK} or 0.0.0.0, found {short(host)!r}") from error
-    last: OSError | None = None
+    dualstack, reason = family == socket.AF_INET6 and socket.has_dualstack_ipv6(), ""
     for wanted in (port,) if port else (PORT, 0):
-        listener = socket.socket(family)
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            listener.bind((host, wanted))
-            listener.listen()  # before the address is printed
-        except (OSError, OverflowError) as error:
-            listener.close()
-            last = error if isinstance(error, OSError) else OSError(str(error))
-            continue
-        return listener
-    reason = last.strerror or str(last) if last else ""
+            return socket.create_server((host, wanted), family=family, dualstack_ipv6=dualstack)
+        except OSError as error:
+            reason = error.strerror or str(error)
     raise UserError(f"host, port: expected an address that is free, found {host}:{port} ({reason}); choose another port")
 
 
