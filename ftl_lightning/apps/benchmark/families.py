@@ -134,7 +134,7 @@ _stroke_judge = cache(strokes.Judge.of)
 
 def stroke_kinds(samples: NDArray[np.float32]) -> Sequence[str]:
     """The kind of each stroke ``(sample, 40, 2)``, invariant to position and size; empty for non-finite strokes."""
-    finite = np.isfinite(samples).all(axis=(1, 2))
+    finite = [bool(np.isfinite(stroke).all()) for stroke in samples]
     kinds = _stroke_judge().kind(np.nan_to_num(samples, nan=0, posinf=0, neginf=0))
     return [kind if good else "" for kind, good in zip(kinds, finite, strict=True)]
 

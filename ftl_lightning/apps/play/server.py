@@ -42,6 +42,20 @@ HEADERS: Mapping[str, str] = {
     "x-frame-options": "DENY",
 }
 """Headers of every answer."""
+MISTAKES = (
+    UserError,
+    ArithmeticError,
+    AssertionError,
+    AttributeError,
+    ClientDisconnect,
+    LookupError,
+    MemoryError,
+    OSError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+)
+"""Exceptions that are reported in one line. Starlette handles the class Exception outside of the guard, which adds headers."""
 Begin = Callable[[], Awaitable[Any]]
 """Called at the start, while requests are already answered."""
 
@@ -132,8 +146,7 @@ def guarded(
         if beginning is not None:
             beginning.cancel()
 
-    # Starlette handles errors of class Exception outside of the guard, which adds headers.
-    handlers: Any = {HTTPException: _refused, BaseException: _mistaken}
+    handlers: Any = {HTTPException: _refused, **dict.fromkeys(MISTAKES, _mistaken)}
     all_routes = [*routes, Route("/api/end", ended, methods=["POST"])]
     application = Starlette(routes=all_routes, exception_handlers=handlers, lifespan=lifespan)
     application.add_middleware(Guard, token=token, hosts=frozenset(hosts))
