@@ -165,8 +165,8 @@ def read_raters(paths: Sequence[Path], key: Key) -> tuple[list[Rater], list[str]
     for path in dict.fromkeys(files):
         try:
             rater = read_rater(path, key)
-            if (first := raters.get(rater.name)) is not None:
-                raise UserError(f"{path}: expected another rater than {first.file} has, found the same; keep one of the two")
+            expected = f"another rater than {raters.get(rater.name, rater).file} has"
+            require(rater.name not in raters, str(path), expected, "the same; keep one of the two")
             raters[rater.name] = rater
         except UserError as error:
             refused.append(str(error))
