@@ -118,6 +118,10 @@ def read_key(path: Path) -> Key:
         for name, question in key.questions.items():
             known = question.films and {*question.films} <= key.films.keys()
             require(known, f"key 'questions.{short(name)}.films'", "some of the key's films", short(", ".join(question.films)))
+            complete = {CHECK: question.expected, BEST: question.setting and question.scenario}.get(question.kind, True)
+            require(
+                complete, f"key 'questions.{short(name)}'", "what a check expects, or a comparison's scenario and setting", "none"
+            )
         require(all(key.repeated().values()), "key 'questions'", "the original of each repeated question", "none")
     return key
 
