@@ -133,7 +133,7 @@ def test_raters_see_films_in_other_orders_and_repeats_apart(study: Made, rater: 
     assert sorted(orders[0]) == sorted(orders[1]) == sorted(key.questions)
     assert orders[0] != orders[1]
     for order in orders:
-        kinds = [key.questions[name]["kind"] == "best" for name in order]
+        kinds = [key.questions[name].kind == "best" for name in order]
         assert kinds == sorted(kinds)  # films alone come first
         asked = [key.questions[name].films for name in order]
         for films in repeated:
