@@ -34,14 +34,14 @@ INSTRUCTIONS = {YES: "This question checks attention: please answer Yes.", NO: "
 
 @dataclass(frozen=True)
 class ListedFilm:
-    """Film of a listing; an empty text or ``None`` for a default."""
+    """Film of a listing; an empty text or a row of -1, which no listing may give, for a default."""
 
     concept: str
     method: str
     file: str
     scenario: str = ""
     setting: str = ""
-    row: int | None = None
+    row: int = -1
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ def read_films(folder: Path, domain: Domain, scenarios: int, seed: int) -> list[
     films = []
     for entry in entries:
         source, concept = sources[entry.file], entry.concept
-        if entry.row is not None:
+        if entry.row >= 0:
             rows = [entry.row]
         elif entry.method in CHECKS:
             rows = [0]
