@@ -13,10 +13,10 @@ sys.path.insert(0, str(Path(__file__).parent.parent))  # the package of this che
 
 import numpy as np
 
-from ftl_lightning.apps.play.offline import WEIGHTS, write_offline
+from ftl_lightning.apps.benchmark.strokes import strokes
+from ftl_lightning.apps.play.page import WEIGHTS, write_offline
 from ftl_lightning.apps.play.requests import Learn
 from ftl_lightning.apps.play.workspace import Workspace
-from ftl_lightning.apps.testing.strokes import strokes
 from ftl_lightning.reporting.html.page import write_page
 
 PLAYABLE = {

@@ -1,16 +1,15 @@
 """A small domain of waving stick figures, and what is asked about it: for tests of the study alone. Nobody answered anything."""
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from ftl_lightning.apps.study.answers import Key
-from ftl_lightning.apps.study.films import read_films
 from ftl_lightning.apps.study.page import Made, make_study
-from ftl_lightning.apps.study.questions import ask
+from ftl_lightning.apps.study.questions import ask, read_films
+from ftl_lightning.apps.study.report import Key, Question
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.domain import Concepts, Domain, Plans
 from ftl_lightning.domains.mocap.rendering import film, picture, wireframe
@@ -61,7 +60,7 @@ def make(films: Path, out: Path, **options: Any) -> Made:
     return make_study(domain, questions, out, **told)
 
 
-Opinion = Callable[[Mapping[str, Any], Key], str | None]
+Opinion = Callable[[Question, Key], str | None]
 """``(question, key) -> answer``, or ``None`` for that of somebody attentive who says yes to ours alone."""
 
 
@@ -69,9 +68,9 @@ def simulated(path: Path, key: Key, name: str, opinion: Opinion = lambda questio
     """A file of answers as a page would save it, of nobody."""
     answers = []
     for number, question in key.questions.items():
-        methods = {film: key.films[film]["method"] for film in question["films"]}
-        usual = question.get("expected", "yes" if set(methods.values()) == {"Ours"} else "no")
-        if question["kind"] == "best":
+        methods = {film: key.films[film].method for film in question.films}
+        usual = question.expected or ("yes" if set(methods.values()) == {"Ours"} else "no")
+        if question.kind == "best":
             usual = next(film for film, method in methods.items() if method == "Ours")
         answers.append({"id": number, "answer": opinion(question, key) or usual, "milliseconds": 900})
     content = {"kind": "study answers", "format": 1, "study": key.study, "page": key.page, "rater": name, "finished": "now"}

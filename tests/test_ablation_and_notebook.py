@@ -9,8 +9,8 @@ import pytest
 import yaml
 
 from ftl_lightning.apps.ablation import Stage
-from ftl_lightning.apps.ablation.check import check
 from ftl_lightning.apps.ablation.plan import part
+from ftl_lightning.apps.ablation.run import check
 from ftl_lightning.cli.main import main
 from ftl_lightning.evaluation.results import read_rows
 from ftl_lightning.services.configuration import load

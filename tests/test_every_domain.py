@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ftl_lightning.apps.testing.strokes import strokes
+from ftl_lightning.apps.benchmark.strokes import strokes
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.evaluation.results import read_rows
 from ftl_lightning.igm.concept import Concept

@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 from PIL import Image
 
-from ftl_lightning.apps.study.answers import read_key
+from ftl_lightning.apps.study.report import read_key
 from ftl_lightning.cli.main import main
 from ftl_lightning.domains.pictures import line_drawings
 from ftl_lightning.evaluation.animation import captioned
@@ -532,7 +532,7 @@ def test_a_film_of_something_else_is_told_in_one_short_line(films: Path, capsys:
     for change in (*rows, {"scenario": ["a"]}, {"setting": None}, {"method": 3}, {"x" * 1000: 1}):
         film = {"concept": "walk", "method": "BC", "file": "BC/walk.safetensors", **change}
         (films / "films.json").write_text(json.dumps([film]))
-        expected = "key 'row' of BC/walk.safetensors: expected 0 to 1, found " if "row" in change else "film 0: "
+        expected = "key 'row' of BC/walk.safetensors: expected 0 to 1, found 2" if change == {"row": 2} else "key 'films[0]."
         refused(capsys, ["study", "tests.study:PEOPLE", f"--films={films}", "--out=study"], f"films.json: {expected}")
 
 

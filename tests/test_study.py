@@ -10,10 +10,17 @@ from typing import Any
 
 import pytest
 
-from ftl_lightning.apps.study.agreement import krippendorff_alpha
-from ftl_lightning.apps.study.answers import Key, inattention, read_key, read_rater
-from ftl_lightning.apps.study.films import read_films
-from ftl_lightning.apps.study.report import Report, study_table
+from ftl_lightning.apps.study.questions import read_films
+from ftl_lightning.apps.study.report import (
+    Key,
+    Question,
+    Report,
+    inattention,
+    krippendorff_alpha,
+    read_key,
+    read_rater,
+    study_table,
+)
 from ftl_lightning.cli.main import main
 from ftl_lightning.services.errors import UserError
 from tests.conftest import refused
@@ -66,8 +73,8 @@ def test_a_page_does_not_say_which_method_is_which(films: Path, tmp_path: Path) 
     assert not any(re.search(rf"\b{method}\b", told) for method in METHODS)
     assert not re.search(r"check\"|expected|safetensors|scenario|method", told)
     key = read_key(made.key)
-    assert {film["method"] for film in key.films.values()} == set(METHODS)
-    numbers = {method: [int(name[1:]) for name, film in key.films.items() if film["method"] == method] for method in METHODS}
+    assert {film.method for film in key.films.values()} == set(METHODS)
+    numbers = {method: [int(name[1:]) for name, film in key.films.items() if film.method == method] for method in METHODS}
     assert all(max(own) - min(own) > 6 for own in numbers.values())  # dealt out
 
 
@@ -136,9 +143,9 @@ def one_film(file: str, **more: int) -> Any:
         (lambda made: (made / "VAE/run.safetensors").unlink(), "scenario 'run': expected a film of each of BC, Ours, VAE, found"),
         (lambda made: (made / "VAE/run.safetensors").write_text("no"), "run.safetensors: expected a demonstrations file"),
         (listed("{"), "films.json: expected JSON"),
-        (listed("[]"), "films.json: expected a list of films, found an empty one"),
-        (listed('[{"concept": "walk"}]'), "film 0: key 'method': expected a text"),
-        (listed('[{"film": 1}]'), "film 0: expected the keys concept, method, file"),
+        (listed("[]"), "films.json: films: expected a list with one or more films, found []"),
+        (listed('[{"concept": "walk"}]'), "films.json: key 'films[0].method': expected a value, found none"),
+        (listed('[{"film": 1}]'), "films.json: key 'films[0].film': expected one of concept, method, file"),
         (one_film("BC/walk.safetensors", row=9), "key 'row' of BC/walk.safetensors: expected 0 to 1, found 9"),
         (one_film("no.safetensors"), "no.safetensors: expected a demonstrations file, found nothing"),
     ],
@@ -154,7 +161,7 @@ def test_mistakes_in_a_study_are_told(films: Path, capsys: pytest.CaptureFixture
     people, unseen = (["study", f"tests.study:{name}", "--films", str(films)] for name in ("PEOPLE", "UNSEEN"))
     few = "expected 3 samples or more in every method's file, found 2; see --scenarios"
     refused(capsys, [*people, "--scenarios", "3"], few)
-    refused(capsys, unseen, "domain: expected one whose plans are filmed, found unseen")
+    refused(capsys, unseen, "domain: expected a domain whose plans are filmed, found unseen")
     refused(capsys, [*people, "--repeats=-1"], "repeats: expected 0 or more, found -1")
     (films / "films.json").write_text("{")
     refused(capsys, [*people, "--out=study"], "films.json: expected JSON")
@@ -182,14 +189,14 @@ def test_agreement_is_that_of_published_examples_one_where_all_agree_and_unknown
 def chosen(counts: Mapping[str, int], kind: str) -> Any:
     """Somebody who says, of training concepts, a method's name so many times: as best, or of its films that they depict theirs."""
 
-    def opinion(question: Mapping[str, Any], key: Key) -> str | None:
-        shown = [key.films[name] for name in question["films"]]
-        if question["kind"] == "best" and kind == "best" and question["setting"] == "training":
-            turn = TRAINING.index(question["scenario"])
+    def opinion(question: Question, key: Key) -> str | None:
+        shown = [key.films[name] for name in question.films]
+        if question.kind == "best" and kind == "best" and question.setting == "training":
+            turn = TRAINING.index(question.scenario)
             method = [name for name, count in counts.items() for _ in range(count)][turn]
-            return next(name for name in question["films"] if key.films[name]["method"] == method)
-        if question["kind"] in ("depicts", "repeat") and kind == "depicts" and shown[0]["setting"] == "training":
-            return "yes" if TRAINING.index(shown[0]["concept"]) < counts[shown[0]["method"]] else "no"
+            return next(name for name in question.films if key.films[name].method == method)
+        if question.kind in ("depicts", "repeat") and kind == "depicts" and shown[0].setting == "training":
+            return "yes" if TRAINING.index(shown[0].concept) < counts[shown[0].method] else "no"
         return None
 
     return opinion
@@ -233,7 +240,7 @@ def test_the_report_is_printed_with_what_was_left_out(key: Key, tmp_path: Path, 
     folder = tmp_path / "study"
     for number in range(3):
         simulated(folder / f"answers-{number}.json", key, f"r{number}")
-    simulated(folder / "answers-3.json", key, "r3", lambda question, key: "yes" if question["kind"] != "best" else None)
+    simulated(folder / "answers-3.json", key, "r3", lambda question, key: "yes" if question.kind != "best" else None)
     (folder / "answers-4.json").write_text("{")
     assert main(["study-report", *sorted(map(str, folder.glob("answers*.json")))]) == 0
     out, err = capsys.readouterr()
@@ -254,11 +261,11 @@ def test_raters_fail_by_a_wrong_check_or_by_answering_repeats_in_two_ways(key: K
         return inattention(read_rater(simulated(tmp_path / "one.json", key, "r", opinion), key), key)
 
     def contrary(count: int) -> Any:
-        films = [repeat["films"] for repeat in key.of_kind("repeat").values()][:count]
+        films = [repeat.films for repeat in key.of_kind("repeat").values()][:count]
 
-        def opinion(question: Mapping[str, Any], key: Key) -> str | None:
-            if question["kind"] == "repeat" and question["films"] in films:
-                return "no" if key.films[question["films"][0]]["method"] == "Ours" else "yes"
+        def opinion(question: Question, key: Key) -> str | None:
+            if question.kind == "repeat" and question.films in films:
+                return "no" if key.films[question.films[0]].method == "Ours" else "yes"
             return None
 
         return opinion
@@ -266,7 +273,7 @@ def test_raters_fail_by_a_wrong_check_or_by_answering_repeats_in_two_ways(key: K
     assert failing(lambda question, key: None) == ""
     assert failing(contrary(1)) == ""
     assert failing(contrary(2)) == "2 of 2 questions that were asked twice answered in two ways"
-    wrong = failing(lambda question, key: "no" if question.get("expected") == "yes" else None)
+    wrong = failing(lambda question, key: "no" if question.expected == "yes" else None)
     assert wrong == "1 of 3 attention checks answered wrongly"
 
 
@@ -316,4 +323,4 @@ def test_a_report_of_nothing_or_with_a_damaged_key_is_told(key: Key, tmp_path: P
         refused(capsys, ["study-report", *arguments], message)
     for content in ("", "[]", "{}", "\x00", '{"kind": "study key", "format": 1, "study": "x"}'):
         (tmp_path / "key.json").write_text(content)
-        refused(capsys, ["study-report", str(answers)], "key.json: expected")
+        refused(capsys, ["study-report", str(answers)], "key.json: ", "expected")

@@ -48,7 +48,7 @@ def fit(path: Path, *options: str) -> list[str]:
         path: of the configuration, relative to ``conf``.
         options: after all others.
     """
-    from ftl_lightning.apps.testing.strokes import TRAINING, strokes
+    from ftl_lightning.apps.benchmark.strokes import TRAINING, strokes
     from ftl_lightning.domains.mocap.tasks import TRAINING_CONCEPTS
 
     domain, method = path.stem, path.parent.name or path.stem

@@ -16,7 +16,7 @@ import torch
 from families import FAMILIES
 from forms import pretrained
 
-from ftl_lightning.apps.testing.strokes import NEW, TRAINING, strokes
+from ftl_lightning.apps.benchmark.strokes import NEW, TRAINING, strokes
 from ftl_lightning.data.check import check
 from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.domains.registry import load_domain

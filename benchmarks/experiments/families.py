@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ftl_lightning.apps.testing.families import beats, pictures, reaches
+from ftl_lightning.apps.benchmark.families import beats, pictures, reaches
 from ftl_lightning.domains.object_rearrangement.scenes import columns, overlap, random_scenes
 
 TEMPLATES, TEMPLATE_SEED = 80, 990

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from forms import compared
 
-from ftl_lightning.apps.testing.strokes import NEW, TRAINING, recognised, strokes
+from ftl_lightning.apps.benchmark.strokes import NEW, TRAINING, recognised, strokes
 from ftl_lightning.cli.main import main as ftl_lightning
 from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.igm.concept import file_name

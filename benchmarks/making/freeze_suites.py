@@ -28,7 +28,8 @@ def main() -> None:
     for name in options.suites:
         for seed in options.seeds:
             found = {
-                part: dataclasses.asdict(one) for part, one in load_suite(name).prints(seed, options.root, options.parts).items()
+                part: dataclasses.asdict(one)
+                for part, one in load_suite(name).fingerprints(seed, options.root, options.parts).items()
             }
             path = FOLDER / f"{name}.json"
             content = json.loads(path.read_text("utf-8"))

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from ftl_lightning.apps.testing.more_strokes import drawn
+from ftl_lightning.apps.benchmark.strokes import drawn
 from ftl_lightning.evaluation.animation import gif
 from ftl_lightning.services.tensor_file import atomic
 

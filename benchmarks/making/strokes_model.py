@@ -1,4 +1,4 @@
-"""Pretrain the shipped model of strokes on ``ftl_lightning.apps.testing.more_strokes``, and judge it on new kinds.
+"""Pretrain the shipped model of strokes on ``ftl_lightning.apps.benchmark.strokes``, and judge it on new kinds.
 
 ``--pretrain FOLDER`` draws the strokes, runs ``fit`` with ``conf/own.yaml`` and puts the model there. Without it a model is
 measured: each new kind is learned from five strokes, in each of :data:`WAYS` to learn, and fifty samples are judged by the nearest
@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ftl_lightning.apps.testing.more_strokes import BACKWARDS, KNOWN, MIRRORED, RANDOM, TEST, VALIDATION, Judge, drawn
+from ftl_lightning.apps.benchmark.strokes import BACKWARDS, KNOWN, MIRRORED, RANDOM, TEST, VALIDATION, Judge, drawn
 from ftl_lightning.cli.main import main as ftl_lightning
 from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.services.tensor_file import write_text
@@ -39,7 +39,7 @@ DENOISER = "{hidden_dim: 256, depth: 3, condition_dim: 256}"
 FEW, SAMPLES = 5, 50
 """Strokes that are learned from, and judged."""
 HANDS = {"many hands": 0.0, "one hand": 0.6}
-"""How much alike the five strokes of a kind are, see :func:`ftl_lightning.apps.testing.more_strokes.drawn`."""
+"""How much alike the five strokes of a kind are, see :func:`ftl_lightning.apps.benchmark.strokes.drawn`."""
 WAYS: dict[str, dict[str, Any]] = {
     "first look": {"form": "paper", "steps": 100, "samples": 16, "learning_rate": 0.3},
     "finished": {"form": "paper"},

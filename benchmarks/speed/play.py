@@ -3,7 +3,7 @@
     python benchmarks/speed/play.py [--out results/play.json] [--kinds KIND ...]
 
 Chromium draws with a synthetic mouse. Each kind is one that pretraining does not show, in five strokes as a hand draws them
-(:mod:`ftl_lightning.apps.testing.more_strokes`). Samples are classified by nearest templates, independently of learning.
+(:mod:`ftl_lightning.apps.benchmark.strokes`). Samples are classified by nearest templates, independently of learning.
 Seconds are of this machine, whatever else runs on it.
 """
 
@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from ftl_lightning.apps.testing.more_strokes import TEST, VALIDATION, Judge, drawn
+from ftl_lightning.apps.benchmark.strokes import TEST, VALIDATION, Judge, drawn
 from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.services.tensor_file import write_text

@@ -30,7 +30,7 @@ import pandas as pd
 import yaml
 
 from ftl_lightning.apps.ablation.plan import Stage
-from ftl_lightning.apps.ablation.record import Entry, read_record
+from ftl_lightning.apps.ablation.record import CellRecord, read_record
 from ftl_lightning.evaluation.results import read_rows
 from ftl_lightning.services.progress import bar
 from ftl_lightning.services.tensor_file import write_text
@@ -164,7 +164,7 @@ def disturbed(folder: Path, results: str, count: int, draw: random.Random, nodes
     raise TimeoutError(f"{folder / 'said.txt'}: the grid did not end well after {MOST_COMMANDS} commands")
 
 
-def running(results: Path) -> dict[str, Entry]:
+def running(results: Path) -> dict[str, CellRecord]:
     """The cells that run."""
     return {name: entry for name, entry in read_record(results).items() if entry.state == "running"}
 

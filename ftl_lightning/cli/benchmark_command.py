@@ -9,7 +9,7 @@ from ftl_lightning.services.errors import UserError, short
 from ftl_lightning.services.printing import line, say
 
 if TYPE_CHECKING:
-    from ftl_lightning.apps.benchmark.run import Entry
+    from ftl_lightning.apps.benchmark.run import Candidate
     from ftl_lightning.apps.benchmark.submission import Submission
 
 
@@ -77,11 +77,11 @@ def _root(options: BenchmarkOptions) -> Path | None:
     return Path(options.root) if options.root else None
 
 
-def _entry(options: BenchmarkOptions, work: Path) -> "Entry":
+def _entry(options: BenchmarkOptions, work: Path) -> "Candidate":
     """The method to run, with a folder for models and logs."""
-    from ftl_lightning.apps.benchmark.run import Entry
+    from ftl_lightning.apps.benchmark.run import Candidate
 
-    return Entry(options.method, options.model, options.configurations, _root(options), work)
+    return Candidate(options.method, options.model, options.configurations, _root(options), work)
 
 
 def benchmark(options: BenchmarkOptions) -> None:
@@ -101,8 +101,7 @@ def benchmark(options: BenchmarkOptions) -> None:
         write_text(Path(options.leaderboard), leaderboard(submissions))
         say(f"{options.leaderboard}: {counted(len(submissions), 'submission')}")
     elif options.data:
-        from ftl_lightning.apps.benchmark.data import write_data
-        from ftl_lightning.apps.benchmark.suite import load_suite
+        from ftl_lightning.apps.benchmark.suite import load_suite, write_data
 
         for name in _chosen(options):
             written = write_data(load_suite(name), _numbers(options), Path(options.data), options.format, _root(options))

@@ -218,9 +218,8 @@ class StudyOptions:
 
 def study(options: StudyOptions) -> None:
     """Make the page and its key from ``options``."""
-    from ftl_lightning.apps.study.films import read_films
     from ftl_lightning.apps.study.page import make_study
-    from ftl_lightning.apps.study.questions import ask
+    from ftl_lightning.apps.study.questions import ask, read_films
     from ftl_lightning.domains.registry import load_domain
     from ftl_lightning.services.limits import read_text
 

@@ -77,7 +77,7 @@ def play(options: PlayOptions) -> None:
 
 
 def _write_static(workspace: "Workspace", path: Path, pairs: "list[tuple[str, str]]") -> None:
-    from ftl_lightning.apps.play.offline import PAIRS, WEIGHTS, write_offline
+    from ftl_lightning.apps.play.page import PAIRS, WEIGHTS, write_offline
     from ftl_lightning.apps.play.requests import Learn
     from ftl_lightning.services.printing import say
     from ftl_lightning.services.progress import bar
@@ -118,8 +118,8 @@ def view(options: ViewOptions) -> None:
 
     check_extra("play", "view: its server")
     from ftl_lightning.apps.play.application import reading, viewing
+    from ftl_lightning.apps.play.page import holds_results, results_page, viewed
     from ftl_lightning.apps.play.server import Place, serve
-    from ftl_lightning.apps.play.viewer import holds_results, results_page, viewed
 
     results = holds_results(options.file)
     routes = reading(results_page(options.file)) if results else viewing(viewed(options.file, options.pretrained))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from ftl_lightning.apps.testing.strokes import recognised, strokes
+from ftl_lightning.apps.benchmark.strokes import recognised, strokes
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.films import VectorFilm, still
 from ftl_lightning.domains.from_file import own_domain

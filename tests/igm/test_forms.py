@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from ftl_lightning.apps.testing.strokes import strokes
+from ftl_lightning.apps.benchmark.strokes import strokes
 from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.data.features import Feature
 from ftl_lightning.data.normalization import Normalization

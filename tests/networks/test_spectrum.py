@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from ftl_lightning.apps.testing.strokes import strokes
+from ftl_lightning.apps.benchmark.strokes import strokes
 from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.igm.diffusion import Prediction
 from ftl_lightning.methods.ftl_igm.pretraining import PretrainingModule

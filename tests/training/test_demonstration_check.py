@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from ftl_lightning.apps.testing.strokes import strokes
+from ftl_lightning.apps.benchmark.strokes import strokes
 from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.few_shot.learner import FewShot

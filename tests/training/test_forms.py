@@ -7,7 +7,7 @@ import pytest
 import torch
 from matplotlib.colors import to_hex
 
-from ftl_lightning.apps.testing.strokes import strokes
+from ftl_lightning.apps.benchmark.strokes import strokes
 from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.domains.object_rearrangement.scenes import columns, random_scenes
 from ftl_lightning.few_shot.learner import FewShot

@@ -1,23 +1,22 @@
 """Run cells on a Ray cluster, placed by their resources; a cell that loses its process or machine runs once more."""
 
-import fcntl
+import itertools
 import os
-import shutil
 import socket
 import tempfile
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ftl_lightning.apps.ablation.outcome import Attempt, Outcome, Run, Tell
 from ftl_lightning.apps.ablation.plan import Cell
+from ftl_lightning.apps.ablation.record import Attempt, Outcome, Run, Tell
 from ftl_lightning.services import trust
-from ftl_lightning.services.errors import UserError, short
-from ftl_lightning.services.tensor_file import alone, write_text
+from ftl_lightning.services.errors import UserError, require, short
+from ftl_lightning.services.tensor_file import write_text
 
 POLL = 0.5
 """Seconds between two checks of the cells."""
@@ -29,7 +28,6 @@ NODE_WAIT = 60.0
 """Maximum seconds that a cell waits for a machine that has left the cluster."""
 MOST_RUNS = 2
 """Maximum runs of a cell, so that a cell that crashes machines does not crash them all."""
-_FOLDER = ".cells."
 
 
 @contextmanager
@@ -53,7 +51,7 @@ def cluster(address: str, attempt: Attempt, cells: Sequence[Cell] = ()) -> Itera
     if started:
         _connect(address or os.environ.get("RAY_ADDRESS", ""))
     try:
-        _expect_room(cells)
+        _check_room(cells)
         yield partial(_run, attempt)
     finally:
         if started:
@@ -63,14 +61,13 @@ def cluster(address: str, attempt: Attempt, cells: Sequence[Cell] = ()) -> Itera
 def _connect(address: str) -> None:
     import ray
 
-    if "://" in address:
-        expected = "HOST:PORT of a cluster's head, and ablate called on one of its machines, in a folder that all of them share"
-        raise UserError(f"address: expected {expected}; found {short(address)!r}")
+    expected = "HOST:PORT of a cluster's head, and ablate called on one of its machines, in a folder that all of them share"
+    require("://" not in address, "address", expected, short(address))
     here = _here() if address in ("", "auto") else ""
-    if address == "auto" and not here:
-        raise UserError("address: expected a Ray cluster that this machine is a node of, found none; start it by: ray start")
-    if ":" in address and not _answers(address):
-        raise UserError(f"address: expected the head of a Ray cluster at {short(address)}, found that nothing answers there")
+    expected = "a Ray cluster that this machine is a node of"
+    require(address != "auto" or here, "address", expected, "none; start it by: ray start")
+    expected = f"the head of a Ray cluster at {short(address)}"
+    require(":" not in address or _answers(address), "address", expected, "that nothing answers there")
     os.environ.setdefault("RAY_worker_niceness", "0")  # Ray's default gives workers low priority
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     try:
@@ -125,17 +122,16 @@ def _run(attempt: Attempt, cells: Sequence[Cell], known: set[str], tell: Tell) -
 
     address = ray.get_runtime_context().gcs_address
     remote = ray.remote(max_retries=0)(_attempt_in)  # otherwise Ray silently repeats lost cells
-    with _begun_folder() as folder:
+    with tempfile.TemporaryDirectory(prefix=".cells.", dir=Path.cwd(), ignore_cleanup_errors=True) as folder:
         waiting: dict[Any, _Sent] = {}
 
         def send(cell: Cell, runs: int) -> None:
-            begun = folder / f"{len(sent)}"
-            sent.append(cell)
+            begun = Path(folder, str(next(numbers)))
             task = remote.options(name=cell.folder, **cell.resources.ray())
-            sent_task = task.remote(str(Path.cwd()), cell, known, trust.vouched(), attempt, str(begun), runs > 1)
-            waiting[sent_task] = _Sent(cell, runs, begun)
+            sent = task.remote(str(Path.cwd()), cell, known, trust.vouched(), attempt, str(begun), runs > 1)
+            waiting[sent] = _Sent(cell, runs, begun)
 
-        sent: list[Cell] = []
+        numbers = itertools.count()
         for cell in cells:
             send(cell, 1)
         looked, silent = time.monotonic(), 0.0
@@ -166,25 +162,27 @@ def _run(attempt: Attempt, cells: Sequence[Cell], known: set[str], tell: Tell) -
                 )
 
 
-def _expect_room(cells: Sequence[Cell]) -> None:
+def _check_room(cells: Sequence[Cell]) -> None:
     """Refuse cells that fit on no machine of the cluster and would wait for ever.
 
     Raises:
         UserError: naming the first such cell.
     """
-    nodes = [node["Resources"] for node in _nodes()]
+    nodes = _nodes()
     for cell in cells:
-        if not any(cell.resources.fit(node) for node in nodes):
-            raise UserError(
-                f"resources: {cell}: expected a machine with {cell.resources} in the cluster, found none among {len(nodes)}; "
-                "lower them or add a machine"
-            )
+        require(
+            any(cell.resources.fit(node) for node in nodes),
+            f"resources: {cell}",
+            f"a machine with {cell.resources} in the cluster",
+            f"none among {len(nodes)}; lower them or add a machine",
+        )
 
 
 def _nodes() -> list[dict[str, Any]]:
+    """Resources of the cluster's nodes."""
     import ray
 
-    return [node for node in ray.nodes() if node["Alive"]]
+    return [node["Resources"] for node in ray.nodes() if node["Alive"]]
 
 
 def _tell_begun(waiting: Iterable[_Sent], tell: Tell) -> None:
@@ -210,7 +208,7 @@ def _without_home(waiting: dict[Any, _Sent], now: float) -> Iterator[tuple[Cell,
     """Give up cells that have fitted on no machine for :data:`NODE_WAIT`."""
     import ray
 
-    nodes = [node["Resources"] for node in _nodes()]
+    nodes = _nodes()
     for task, sent in list(waiting.items()):
         if sent.node or any(sent.cell.resources.fit(node) for node in nodes):
             sent.homeless = 0.0
@@ -220,37 +218,6 @@ def _without_home(waiting: dict[Any, _Sent], now: float) -> Iterator[tuple[Cell,
             ray.cancel(task)
             del waiting[task]
             yield sent.cell, Outcome(error=f"no machine of the cluster has {sent.cell.resources} any more")
-
-
-@contextmanager
-def _begun_folder() -> Iterator[Path]:
-    """Create a hidden folder in which cells write their node; folders of killed processes are removed."""
-    with ExitStack() as stack:
-        with alone(Path.cwd()):  # protects new folders until they are locked
-            for left in Path.cwd().glob(f"{_FOLDER}*"):
-                with suppress(OSError), _locked(left):
-                    shutil.rmtree(left)
-            folder = Path(tempfile.mkdtemp(prefix=_FOLDER, dir=Path.cwd()))
-            stack.enter_context(_locked(folder))
-        try:
-            yield folder
-        finally:
-            shutil.rmtree(folder, ignore_errors=True)
-
-
-@contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Lock a folder.
-
-    Raises:
-        OSError: if another process holds the lock.
-    """
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        yield
-    finally:
-        os.close(handle)
 
 
 def _attempt_in(

@@ -1,7 +1,8 @@
-"""The plan of an ablation: stages of a configuration file, and their cells."""
+"""Plan of an ablation: stages of a configuration file, their cells, and the resources of each cell."""
 
 import itertools
 import json
+import math
 import re
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
@@ -9,70 +10,72 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from ftl_lightning.apps.ablation.resources import Resources, read_resources
-from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.errors import UserError, require, short
+
+CPUS, GPUS, MEMORY = "cpus", "gpus", "memory_gb"
+"""Resources of every cluster; others are custom resources of Ray."""
+GIGABYTE = 10**9
+_NAME = re.compile(r"[A-Za-z][\w.-]{0,63}")
 
 
 @dataclass(frozen=True)
-class Stage:
-    """A verb with a grid of options. In values, ``{seed}`` stands for the seed, ``{name}`` for a value of ``each``.
+class Resources:
+    """Resources of a cell.
 
     Attributes:
-        verb: ``fit`` or ``invert``.
-        config: configuration file, or several files to merge in order.
-        name: part of the cells' names, for stages that differ only in their options.
-        each: lists of texts by name, for placeholders in other values; the stage runs for their product.
-        options: options of all cells, by their names on the command line.
-        grid: lists of values by option; the cells are their product.
-        done: file whose presence means that the stage need not run, such as a pretrained model; empty for none. Its content is
-            not checked: remove it after a change of the stage's configuration.
-        seeds: subset of the ablation's seeds; empty for all.
-        resources: resources of each cell on a cluster: ``cpus`` (default 1), ``gpus``, ``memory_gb``, and any resource with which
-            the nodes of a Ray cluster were started.
+        cpus: number of processors; whole, or a fraction below 1.
+        gpus: number of GPUs; likewise.
+        memory_gb: gigabytes of 10^9 bytes; 0 for no request. Slurm enforces the limit, Ray does not.
+        custom: custom resources of a Ray cluster by name, such as ``{'big': 1}`` of nodes started with it.
     """
 
-    verb: Literal["fit", "invert"]
-    config: str | list[str]
-    each: Mapping[str, list[str]] = field(default_factory=dict)
-    options: Mapping[str, Any] = field(default_factory=dict)
-    grid: Mapping[str, list[Any]] = field(default_factory=dict)
-    done: str = ""
-    name: str = ""
-    seeds: Sequence[int] = ()
-    resources: Mapping[str, float] = field(default_factory=dict)
+    cpus: float = 1
+    gpus: float = 0
+    memory_gb: float = 0
+    custom: Mapping[str, float] = field(default_factory=dict)
 
-    @property
-    def configs(self) -> list[str]:
-        """The configuration files.
+    @classmethod
+    def read(cls, amounts: Mapping[str, Any]) -> "Resources":
+        """Read resources from a configuration.
 
         Raises:
-            UserError: if there is none.
+            UserError: for an invalid name or amount.
         """
-        if not self.config:
-            raise UserError("config: expected a configuration file or a list of them, found none")
-        return [self.config] if isinstance(self.config, str) else self.config
+        for name, amount in amounts.items():
+            require(_NAME.fullmatch(name), "resources", f"{CPUS}, {GPUS}, {MEMORY} or a custom resource of the cluster", name)
+            number = isinstance(amount, int | float) and not isinstance(amount, bool) and math.isfinite(amount) and amount >= 0
+            if name == MEMORY:
+                require(number, f"resources.{name}", "a number of 0 or more", amount)
+            else:
+                whole = number and (amount <= 1 or amount % 1 == 0)
+                require(whole, f"resources.{name}", "a whole number of 0 or more, or a fraction of 1", amount)
+        custom = {name: amount for name, amount in amounts.items() if name not in (CPUS, GPUS, MEMORY)}
+        return cls(amounts.get(CPUS, 1), amounts.get(GPUS, 0), amounts.get(MEMORY, 0), custom)
 
-    def cells(self, seed: int) -> Iterator["Cell"]:
-        """The cells of a seed."""
-        if self.seeds and seed not in self.seeds:
-            return
-        for texts in itertools.product(*self.each.values()):
-            names = {"seed": str(seed), **dict(zip(self.each, texts, strict=True))}
-            for values in itertools.product(*self.grid.values()):
-                options = {**self.options, **dict(zip(self.grid, values, strict=True))}
-                texts_of = {key: _text(value, names) for key, value in options.items()}
-                configs = tuple(_text(config, names) for config in self.configs)
-                first, *added = (Path(config).stem for config in configs)
-                said = [*added, *(text for text in texts if text not in (first, *added))]
-                varied = [f"{key.partition('.')[2]} {texts_of[key]}" for key in self.grid]
-                parts = [f"{self.verb} {first}", *said, _text(self.name, names), *varied, f"seed {seed}"]
-                name = ", ".join(filter(None, parts))
-                yield Cell(self.verb, configs, texts_of, _text(self.done, names), name, read_resources(self.resources))
+    def ray(self) -> dict[str, Any]:
+        """Options of a Ray task."""
+        options: dict[str, Any] = {"num_cpus": self.cpus, "num_gpus": self.gpus}
+        if self.memory_gb:
+            options["memory"] = int(self.memory_gb * GIGABYTE)
+        return options | ({"resources": dict(self.custom)} if self.custom else {})
+
+    def fit(self, node: Mapping[str, float]) -> bool:
+        """Whether an idle node of a Ray cluster has these resources.
+
+        Args:
+            node: its resources, in Ray's names (memory in bytes).
+        """
+        needs = {"CPU": self.cpus, "GPU": self.gpus, "memory": self.memory_gb * GIGABYTE, **self.custom}
+        return all(node.get(name, 0) >= amount for name, amount in needs.items())
+
+    def __str__(self) -> str:
+        amounts = {CPUS: self.cpus, GPUS: self.gpus, MEMORY: self.memory_gb, **self.custom}
+        return ", ".join(f"{name} {amount:g}" for name, amount in amounts.items() if amount) or "nothing"
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A run: verb, configuration files, options, ``done`` file, name and resources."""
+    """Run of a verb with configuration files, options, ``done`` file, name and resources."""
 
     verb: Literal["fit", "invert"]
     configs: tuple[str, ...]
@@ -101,10 +104,63 @@ class Cell:
         return self.name
 
 
-def _text(value: Any, names: Mapping[str, str]) -> str:
+@dataclass(frozen=True)
+class Stage:
+    """Verb with a grid of options. In values, ``{seed}`` is replaced by the seed, ``{name}`` by a value of ``each``.
+
+    Attributes:
+        verb: ``fit`` or ``invert``.
+        config: configuration file, or several files to merge in order.
+        name: part of the cells' names, for stages that differ only in their options.
+        each: lists of texts by name, for placeholders in other values; the stage runs for their product.
+        options: options of all cells, by their names on the command line.
+        grid: lists of values by option; the cells are their product.
+        done: file whose presence means that the stage need not run, such as a pretrained model; empty for none. Its content is
+            not checked: remove it after a change of the stage's configuration.
+        seeds: subset of the ablation's seeds; empty for all.
+        resources: resources of each cell on a cluster: ``cpus`` (default 1), ``gpus``, ``memory_gb``, and any resource with which
+            the nodes of a Ray cluster were started.
+    """
+
+    verb: Literal["fit", "invert"]
+    config: str | list[str]
+    each: Mapping[str, list[str]] = field(default_factory=dict)
+    options: Mapping[str, Any] = field(default_factory=dict)
+    grid: Mapping[str, list[Any]] = field(default_factory=dict)
+    done: str = ""
+    name: str = ""
+    seeds: Sequence[int] = ()
+    resources: Mapping[str, float] = field(default_factory=dict)
+
+    def cells(self, seed: int) -> Iterator[Cell]:
+        """The cells of a seed.
+
+        Raises:
+            UserError: without a configuration file, or for invalid resources.
+        """
+        if self.seeds and seed not in self.seeds:
+            return
+        require(self.config, "config", "a configuration file or a list of them", "none")
+        files = [self.config] if isinstance(self.config, str) else self.config
+        for texts in itertools.product(*self.each.values()):
+            names = {"seed": str(seed), **dict(zip(self.each, texts, strict=True))}
+            for values in itertools.product(*self.grid.values()):
+                options = {**self.options, **dict(zip(self.grid, values, strict=True))}
+                filled = {key: _filled(value, names) for key, value in options.items()}
+                configs = tuple(_filled(config, names) for config in files)
+                first, *added = (Path(config).stem for config in configs)
+                given = [*added, *(text for text in texts if text not in (first, *added))]
+                varied = [f"{key.partition('.')[2]} {filled[key]}" for key in self.grid]
+                parts = [f"{self.verb} {first}", *given, _filled(self.name, names), *varied, f"seed {seed}"]
+                name = ", ".join(filter(None, parts))
+                yield Cell(self.verb, configs, filled, _filled(self.done, names), name, Resources.read(self.resources))
+
+
+def _filled(value: Any, names: Mapping[str, str]) -> str:
+    """Text of a value, with placeholders replaced."""
     text = value if isinstance(value, str) else json.dumps(value)
-    for name, standing in names.items():
-        text = text.replace(f"{{{name}}}", standing)
+    for name, replacement in names.items():
+        text = text.replace(f"{{{name}}}", replacement)
     return text
 
 
@@ -116,7 +172,7 @@ def part(plan: Sequence[Sequence[Cell]], shard: str) -> list[list[Cell]]:
     """
     match = re.fullmatch(r"([1-9]\d*)/([1-9]\d*)", shard)
     if not match or int(match[1]) > int(match[2]):
-        raise UserError(f"shard: expected 'number/shards' such as 3/8, found {shard!r}")
+        raise UserError(f"shard: expected 'number/shards' such as 3/8, found {short(shard)!r}")
     number, shards = int(match[1]), int(match[2])
     position = itertools.count()
     return [[cell for cell in cells if next(position) % shards == number - 1] for cells in plan]

@@ -1,30 +1,66 @@
-"""States of cells: a file beside the results, written by all shards, and its table."""
+"""States of cells: a file beside the results, written by all shards; its table; and the estimated cost of a grid."""
 
+import heapq
 import json
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from statistics import mean
+from typing import TYPE_CHECKING, Literal, get_args
 
 from rich.table import Table
 
-from ftl_lightning.apps.ablation.outcome import State
 from ftl_lightning.apps.ablation.plan import Cell
 from ftl_lightning.evaluation.summary import literal
 from ftl_lightning.services.errors import UserError, about, short
 from ftl_lightning.services.printing import line
+from ftl_lightning.services.representation import counted
 from ftl_lightning.services.schema import check_type, read_json
 from ftl_lightning.services.tensor_file import alone, write_text
 
+if TYPE_CHECKING:
+    import pandas as pd
+
 KIND = "cells of an ablation"
 FORMAT = 1
+MINUTE, HOUR = 60.0, 3600.0
 _SEED = re.compile(r", seed \d+$")
+
+State = Literal["queued", "running", "again", "done", "failed"]
+"""State of a cell; ``again`` is queued once more, after its process or machine was lost."""
 
 
 @dataclass(frozen=True)
-class Entry:
-    """State of a cell.
+class Outcome:
+    """Outcome of a cell.
+
+    Attributes:
+        rows: rows of results, or ``None``.
+        note: a short note.
+        error: error of a failed cell, in one line.
+        seconds: duration; 0 if nothing was run.
+        node: the machine that ran the cell.
+    """
+
+    rows: "pd.DataFrame | None" = None
+    note: str = ""
+    error: str = ""
+    seconds: float = 0.0
+    node: str = ""
+
+
+Tell = Callable[[Cell, State, str, str], None]
+"""Callback for a new state of a cell, with machine and note."""
+Run = Callable[[Sequence[Cell], set[str], Tell], Iterator[tuple[Cell, Outcome]]]
+"""Runs cells, given the configuration hashes that need not run; yields each cell with its outcome."""
+Attempt = Callable[[Cell, set[str], bool], Outcome]
+"""Runs a cell, unless its configuration hash is known; the flag says whether it was lost before."""
+
+
+@dataclass(frozen=True)
+class CellRecord:
+    """Recorded state of a cell.
 
     Attributes:
         state: last reported state.
@@ -35,7 +71,7 @@ class Entry:
         note: outcome, or the error.
     """
 
-    state: Literal["queued", "running", "again", "done", "failed"] = "queued"
+    state: State = "queued"
     configs: tuple[str, ...] = ()
     node: str = ""
     runs: int = 0
@@ -48,7 +84,7 @@ def record_path(results: str | Path) -> Path:
     return Path(results).with_suffix(".cells.json")
 
 
-def read_record(results: str | Path) -> dict[str, Entry]:
+def read_record(results: str | Path) -> dict[str, CellRecord]:
     """Read the entries by cell name; empty if there is no file.
 
     Raises:
@@ -59,37 +95,27 @@ def read_record(results: str | Path) -> dict[str, Entry]:
         return {}
     content = read_json(path, KIND)
     with about(path):
-        kind, version = (content.get("kind"), content.get("format")) if isinstance(content, dict) else (None, None)
-        if (kind, version) != (KIND, FORMAT):
+        if not isinstance(content, dict) or (content.get("kind"), content.get("format")) != (KIND, FORMAT):
             raise UserError(f"expected {KIND} of format {FORMAT}, found another file; remove it, it holds no results")
-        entries: dict[str, Entry] = check_type(content.get("cells"), dict[str, Entry], "cells")
+        entries: dict[str, CellRecord] = check_type(content.get("cells"), dict[str, CellRecord], "cells")
         return entries
 
 
 def tell(results: str | Path, cells: Sequence[Cell], state: State, node: str = "", note: str = "", seconds: float = 0.0) -> None:
-    """Record a new state of cells. The file is locked against other processes.
+    """Record a new state of cells, with machine, outcome or error, and duration; other processes are locked out.
 
-    Args:
-        results: the results file.
-        cells: the cells.
-        state: the new state.
-        node: the machine; empty to keep the known machine.
-        note: the outcome, the error, or the reason for another run.
-        seconds: duration of a completed run; 0 to keep the known duration.
+    An empty node and 0 seconds keep the known values.
     """
     path = record_path(results)
     with alone(path.parent):
         entries = read_record(results)
         for cell in cells:
-            before = entries.get(cell.name, Entry())
-            runs = 0 if state == "queued" else before.runs + (state == "running")
-            known = "" if state == "queued" else before.node
-            entries[cell.name] = replace(
-                before,
+            before = entries.get(cell.name, CellRecord())
+            entries[cell.name] = CellRecord(
                 state=state,
                 configs=cell.configs,
-                node=node or known,
-                runs=runs,
+                node=node or ("" if state == "queued" else before.node),
+                runs=0 if state == "queued" else before.runs + (state == "running"),
                 seconds=round(seconds, 2) or before.seconds,
                 note=line(note),
             )
@@ -97,25 +123,12 @@ def tell(results: str | Path, cells: Sequence[Cell], state: State, node: str = "
         write_text(path, json.dumps(content, indent=1, ensure_ascii=False) + "\n")
 
 
-def without_seed(name: str) -> str:
-    """The name of a cell without its seed; cells with the same name take about as long."""
-    return _SEED.sub("", name)
-
-
-def table(entries: Mapping[str, Entry], cells: Sequence[Cell]) -> Table:
-    """Table of cells with state, machine, runs, seconds, and outcome or error.
-
-    Args:
-        entries: entries of the record.
-        cells: cells of the plan, in order; cells without an entry were never started.
-    """
-    known = {cell.name: entries.get(cell.name, Entry()) for cell in cells}
-    shown = Table(title=counted([entry.state for entry in known.values()]))
-    for name in ("cell", "state", "node"):
-        shown.add_column(name)
-    for name in ("runs", "seconds"):
-        shown.add_column(name, justify="right")
-    shown.add_column("note")
+def table(entries: Mapping[str, CellRecord], cells: Sequence[Cell]) -> Table:
+    """Table of cells with state, machine, runs, seconds, and outcome or error; cells without an entry were never started."""
+    known = {cell.name: entries.get(cell.name, CellRecord()) for cell in cells}
+    shown = Table(title=count_states([entry.state for entry in known.values()]))
+    for name in ("cell", "state", "node", "runs", "seconds", "note"):
+        shown.add_column(name, justify="right" if name in ("runs", "seconds") else "left")
     for name, entry in known.items():
         seconds = f"{entry.seconds:.0f}" if entry.seconds else ""
         runs = str(entry.runs or "")
@@ -123,15 +136,77 @@ def table(entries: Mapping[str, Entry], cells: Sequence[Cell]) -> Table:
     return shown
 
 
-def counted(states: Sequence[str]) -> str:
+def count_states(states: Sequence[str]) -> str:
     """Count cells by state: ``'4 cells: 1 queued, 3 done'``."""
     parts = [f"{states.count(state)} {state}" for state in get_args(State) if state in states]
-    cells = f"{len(states)} {'cell' if len(states) == 1 else 'cells'}"
+    cells = counted(len(states), "cell")
     return f"{cells}: {', '.join(parts)}" if parts else cells
 
 
-def by_node(entries: Mapping[str, Entry], cells: Sequence[Cell]) -> list[str]:
+def by_node(entries: Mapping[str, CellRecord], cells: Sequence[Cell]) -> list[str]:
     """Counts of cells by state, in a line for each machine."""
     known = [entries[cell.name] for cell in cells if cell.name in entries]
     nodes = sorted({entry.node for entry in known if entry.node})
-    return [f"{node}: {counted([entry.state for entry in known if entry.node == node])}" for node in nodes]
+    return [f"{node}: {count_states([entry.state for entry in known if entry.node == node])}" for node in nodes]
+
+
+def seconds_of(cell: Cell, entries: Mapping[str, CellRecord]) -> float | None:
+    """Measured seconds of a cell, or else the mean over similar cells; ``None`` without measurements.
+
+    Similar cells are, in order: the same cell with other seeds; cells of the same configuration files with other options.
+    """
+    measured = {name: entry for name, entry in entries.items() if entry.seconds}
+    if cell.name in measured:
+        return measured[cell.name].seconds
+    plain = _SEED.sub("", cell.name)
+    same = [entry.seconds for name, entry in measured.items() if _SEED.sub("", name) == plain]
+    verb = f"{cell.verb} "
+    similar = same or [entry.seconds for name, entry in measured.items() if entry.configs == cell.configs and name.startswith(verb)]
+    return mean(similar) if similar else None
+
+
+def makespan(seconds: Sequence[Sequence[float]], workers: int) -> float:
+    """Total seconds of consecutive stages, given the durations of their cells, when the next cell goes to the first free worker."""
+    total = 0.0
+    for stage in seconds:
+        free = [0.0] * workers
+        for duration in stage:
+            heapq.heapreplace(free, free[0] + duration)
+        total += max(free)
+    return total
+
+
+def estimate(plan: Sequence[Sequence[Cell]], entries: Mapping[str, CellRecord], total: int, workers: int = 0) -> list[str]:
+    """Lines with the number of cells to run and the estimated hours, if known.
+
+    Args:
+        plan: the cells to run of each stage.
+        entries: entries of the record.
+        total: number of cells of the whole plan.
+        workers: number of parallel cells; 0 for the powers of two up to the number of cells.
+    """
+    cells = [cell for stage in plan for cell in stage]
+    lines = [f"{total} cells: {total - len(cells)} need not be run, {len(cells)} to run"]
+    if not cells:
+        return lines
+    times = [[(cell, seconds_of(cell, entries)) for cell in stage] for stage in plan]
+    known = [[seconds for _, seconds in stage if seconds is not None] for stage in times]
+    unknown = [cell.name for stage in times for cell, seconds in stage if seconds is None]
+    count = len(cells) - len(unknown)
+    if not count:
+        return [*lines, "hours: not known, as no cell like them was measured; run one, for example with --shard, and ask again"]
+    if unknown:
+        lines.append(
+            f"not known: {len(unknown)} of them, without a similar measured cell, such as {unknown[0]}; their time is added"
+        )
+    repeated = sum(entries[cell.name].seconds > 0 for cell in cells if cell.name in entries)
+    lines.append(f"measured: {repeated} of them before, {count - repeated} estimated from other seeds or options of the same files")
+    counts = [workers] if workers else [2**power for power in range((len(cells) - 1).bit_length() + 1)]
+    return [*lines, *(f"{number} at a time: {_time(makespan(known, number))}" for number in counts)]
+
+
+def _time(seconds: float) -> str:
+    """Format a time in hours, minutes or seconds."""
+    if seconds >= HOUR:
+        return f"{seconds / HOUR:.1f} hours"
+    return f"{seconds / MINUTE:.0f} minutes" if seconds >= 2 * MINUTE else f"{seconds:.0f} seconds"

@@ -1,5 +1,6 @@
-"""Run a plan cell by cell, here or on a cluster."""
+"""Check a plan, and run it cell by cell, here or on a cluster."""
 
+import importlib
 import socket
 import tempfile
 import time
@@ -12,73 +13,124 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from ftl_lightning.apps.ablation.check import check
 from ftl_lightning.apps.ablation.cluster import cluster
-from ftl_lightning.apps.ablation.estimate import estimate
-from ftl_lightning.apps.ablation.outcome import Outcome, Run, State, Tell
-from ftl_lightning.apps.ablation.plan import Cell, Stage, part
-from ftl_lightning.apps.ablation.record import by_node, counted, read_record, table, tell
+from ftl_lightning.apps.ablation.plan import Cell, Stage
+from ftl_lightning.apps.ablation.record import (
+    Outcome,
+    Run,
+    State,
+    Tell,
+    by_node,
+    count_states,
+    estimate,
+    read_record,
+    table,
+    tell,
+)
 from ftl_lightning.services import log_folder
 from ftl_lightning.services.configuration import load
-from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.errors import UserError, require
 from ftl_lightning.services.printing import say
 from ftl_lightning.services.progress import bar
+from ftl_lightning.services.shipped import pretrained_folder
+from ftl_lightning.services.trust import check_module
 
 if TYPE_CHECKING:
     from ftl_lightning.apps.lightning_cli import CommandLine
+    from ftl_lightning.training.adaptation import Adaptation
+
+
+def check(cells: Sequence[Cell]) -> None:
+    """Check files, keys and encoder of each cell and, for ``invert``, domain, suites and model.
+
+    Raises:
+        UserError: all mistakes in one line; nothing was started.
+    """
+    made = {cell.options["model.output"] for cell in cells if cell.verb == "fit" and "model.output" in cell.options}
+    mistakes = {}
+    for cell in cells:
+        try:
+            _check(cell, made)
+        except (UserError, ArgumentError) as error:
+            mistakes[cell.command] = " ".join(str(error).split())
+    if mistakes:
+        messages = dict.fromkeys(mistakes.values())
+        raise UserError(f"ablation: {len(mistakes)} of {len(cells)} cells cannot run, none was started: {'; '.join(messages)}")
+
+
+def _check(cell: Cell, made: set[str]) -> None:
+    from ftl_lightning.apps.lightning_cli import parse
+    from ftl_lightning.domains.registry import load_domain
+    from ftl_lightning.networks.text_encoder import load_encoder
+    from ftl_lightning.training.method import kinds_for, model_class
+    from ftl_lightning.training.model_config import read_config
+
+    config = parse(cell.verb, cell.arguments)
+    model, data = config["model"]["init_args"], config["data"]["init_args"]
+    if cell.verb == "fit":
+        load_encoder(data["encoder"], Path(), data["revision"])
+        return
+    adaptation = "pretrained" in model and "domain" in data
+    expected = "the configuration of an adaptation (invert)"
+    require(adaptation, f"verb: {', '.join(cell.configs)}", expected, "that of a pretraining (fit)")
+    if ":" in data["domain"]:
+        check_module(data["domain"], "data.domain")
+    domain = load_domain(data["domain"])
+    for key, names in (("evaluation.suites", config["evaluation"]["suites"] or ()), ("data.suite", [data["suite"]])):
+        unknown = sorted(set(names) - set(domain.concepts.suites))
+        require(not unknown, key, f"some of {', '.join(domain.concepts.suites)} (domain {domain.name})", ", ".join(unknown))
+    if model["pretrained"] not in made:
+        module, _, name = config["model"]["class_path"].rpartition(".")
+        adaptation_class: type[Adaptation] = getattr(importlib.import_module(module), name)
+        trained = read_config(pretrained_folder(model["pretrained"]))
+        network = model_class(trained["kind"])
+        fitting = trained["domain"] == domain.name and network is not None and adaptation_class.adapts(network)
+        expected = f"a model of {domain.name} ({' or '.join(kinds_for(adaptation_class.adapts))})"
+        found = f"one of {trained['domain']} ({trained['kind']}) in {model['pretrained']}"
+        require(fitting, "model.pretrained", expected, found)
+    if "encoder" in model:
+        load_encoder(model["encoder"], domain.concepts.table, model["revision"])
 
 
 def run_ablation(
-    stages: Sequence[Stage],
-    seeds: Sequence[int],
-    results: str,
-    shard: str = "1/1",
-    executor: Literal["local", "ray"] = "local",
-    root: str = "",
-    address: str = "",
-    only: Sequence[int] = (),
+    plan: Sequence[Sequence[Cell]], results: str, executor: Literal["local", "ray"] = "local", address: str = ""
 ) -> None:
-    """Run all cells of all seeds, stage after stage. A failed cell does not stop the others; failures are listed at the end.
+    """Run all cells, stage after stage. A failed cell does not stop the others; failures are listed at the end.
 
     The state of each cell is recorded beside the results, see :mod:`~ftl_lightning.apps.ablation.record`.
 
     Args:
-        stages: stages in order; a stage may read files of earlier stages.
-        seeds: each stage runs once per seed.
+        plan: cells of each stage, in order; a stage may read files of earlier stages.
         results: results file.
-        shard: ``'3/8'`` for the third of eight parts of the plan, run by different machines or processes.
         executor: ``'local'`` runs cells one by one in this process; ``'ray'`` runs cells in parallel on a cluster whose machines
             share this folder. A cell that loses its process or machine runs once more.
-        root: ``data.root`` of every cell; empty for the value of the configurations.
         address: address of the Ray cluster, see :func:`~ftl_lightning.apps.ablation.cluster.cluster`.
-        only: numbers of the stages to run, from 1; empty for all.
 
     Raises:
         UserError: before the first run, for cells that cannot run; at the end, naming failed cells.
     """
     from ftl_lightning.evaluation.results import add_rows
 
-    plan = part(list(planned(stages, seeds, root, only).values()), shard)
-    every = [cell for cells in plan for cell in cells]
-    check(every)
+    all_cells = [cell for cells in plan for cell in cells]
+    check(all_cells)
     read_record(results)  # fails early if damaged
-    total, number, failed = len(every), 0, []
+    total, number, failed = len(all_cells), 0, []
     start = time.monotonic()
     noted = partial(tell, results)
-    states: dict[str, State] = {cell.name: "queued" for cell in every}
+    states: dict[str, State] = {cell.name: "queued" for cell in all_cells}
 
     def record_state(cell: Cell, state: State, node: str, note: str) -> None:
         noted([cell], state, node, note)
         states[cell.name] = state
-        advance(0, counted(list(states.values())))
+        advance(0, count_states(list(states.values())))
         if state == "again":
             say(f"{cell}: runs again, lost on {node or 'its machine'}: {note}")
 
     with (
-        _executor(executor, address, [cell for cell in every if not _is_made(cell)]) as run,
+        _executor(executor, address, [cell for cell in all_cells if not _is_made(cell)]) as run,
         bar("cells", total, lines=False) as advance,
     ):
-        noted(every, "queued")
+        noted(all_cells, "queued")
         for cells in plan:
             for cell, outcome in run(cells, known_hashes(results), record_state):
                 number += 1
@@ -91,57 +143,47 @@ def run_ablation(
                     failed.append(f"{cell}: {outcome.error}")
                 states[cell.name] = "failed" if outcome.error else "done"
                 noted([cell], states[cell.name], outcome.node, outcome.error or outcome.note, outcome.seconds)
-                advance(1, counted(list(states.values())))
+                advance(1, count_states(list(states.values())))
     if failed or executor == "ray":
-        show_cells(results, every)
+        show_cells(results, all_cells)
     if failed:
         raise UserError(f"ablation: {len(failed)} of {total} cells failed: " + "; ".join(failed))
 
 
 def planned(stages: Sequence[Stage], seeds: Sequence[int], root: str = "", only: Sequence[int] = ()) -> dict[int, list[Cell]]:
-    """The cells of each stage by its number, for all seeds.
+    """The cells of each stage by its number, from 1, for all seeds.
 
     Args:
         stages: stages in order.
         seeds: each stage runs once per seed.
         root: ``data.root`` of every cell; empty for the value of the configurations.
-        only: numbers of the stages, from 1; empty for all.
-
-    Raises:
-        UserError: for no seeds, or an unknown number of a stage.
+        only: numbers of the stages; empty for all.
     """
-    if not seeds:
-        raise UserError("seeds: expected one or more, found none")
-    if wrong := [number for number in only if not 1 <= number <= len(stages)]:
-        raise UserError(f"only: expected numbers of stages from 1 to {len(stages)}, found {wrong[0]}")
+    require(seeds, "seeds", "one or more", "none")
+    for number in only:
+        require(1 <= number <= len(stages), "only", f"numbers of stages from 1 to {len(stages)}", number)
     shared = {"data.root": root} if root else {}
-    every = {number: replace(stage, options={**shared, **stage.options}) for number, stage in enumerate(stages, 1)}
-    chosen = {number: stage for number, stage in every.items() if not only or number in only}
+    chosen = {
+        number: replace(stage, options={**shared, **stage.options})
+        for number, stage in enumerate(stages, 1)
+        if not only or number in only
+    }
     return {number: [cell for seed in seeds for cell in stage.cells(seed)] for number, stage in chosen.items()}
 
 
 def show_estimate(plan: Sequence[Sequence[Cell]], results: str, workers: int = 0) -> None:
-    """Print the number of cells to run and the estimated hours, as far as known; nothing runs.
-
-    Args:
-        plan: the cells of each stage.
-        results: results file.
-        workers: number of parallel cells; 0 for several numbers.
-
-    Raises:
-        UserError: for cells that cannot run.
-    """
-    every = [cell for cells in plan for cell in cells]
-    check(every)
+    """Check the cells of each stage; print how many are to run, and the estimated hours for some workers (0: several numbers)."""
+    total = sum(map(len, plan))
+    check([cell for cells in plan for cell in cells])
     known = known_hashes(results)
-    with bar("cells looked at", len(every), lines=False) as advance:
+    with bar("cells looked at", total, lines=False) as advance:
 
         def needed(cell: Cell) -> bool:
             advance()
             return not _is_done(cell, known)
 
         left = [[cell for cell in cells if needed(cell)] for cells in plan]
-    say("\n".join(estimate(left, read_record(results), len(every), workers)))
+    say("\n".join(estimate(left, read_record(results), total, workers)))
 
 
 def _is_made(cell: Cell) -> bool:
@@ -174,8 +216,7 @@ def show_cells(results: str, cells: Sequence[Cell]) -> None:
 @contextmanager
 def _executor(name: str, address: str, cells: Sequence[Cell]) -> Iterator[Run]:
     if name == "local":
-        if address:
-            raise UserError(f"address: expected none without --executor ray, found {address!r}")
+        require(not address, "address", "none without --executor ray", address)
         yield _one_after_another
         return
     with cluster(address, attempt, cells) as run:

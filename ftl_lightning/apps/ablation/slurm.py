@@ -10,15 +10,14 @@ from pathlib import Path
 
 import yaml
 
-from ftl_lightning.apps.ablation.plan import Cell, Stage
-from ftl_lightning.apps.ablation.resources import CPUS, GPUS, MEMORY
+from ftl_lightning.apps.ablation.plan import CPUS, GPUS, MEMORY, Cell, Stage
 from ftl_lightning.services import trust
-from ftl_lightning.services.errors import UserError, shown
+from ftl_lightning.services.errors import UserError, require, shown
 from ftl_lightning.services.tensor_file import write_text
 
 MOST_JOBS = 1000
 """Maximum jobs of an array by Slurm's default."""
-OWN = ("array", "ntasks", "wrap")
+RESERVED = ("array", "ntasks", "wrap")
 """Options of sbatch that the scripts set."""
 _CPUS = "cpus-per-task"
 _OPTION = re.compile(r"[a-z][a-z-]{0,39}")
@@ -61,17 +60,14 @@ def _reads(cell: Cell, made: set[str]) -> bool:
 
 
 def script(wave: Wave, plan: Path, folder: Path, jobs: int = 0, options: Mapping[str, str] = {}) -> str:
-    """The script of an array, in which each job runs a shard of the cells.
+    """Script of an array, in which each job runs a shard of the cells.
 
     Args:
         wave: a wave of the plan.
         plan: the plan's configuration file.
         folder: working folder of the jobs, shared by all machines.
         jobs: number of jobs; 0 for a job per cell, at most :data:`MOST_JOBS`.
-        options: options of sbatch by name; empty values for flags.
-
-    Raises:
-        UserError: for an option that sbatch could misread, or a resource that Slurm does not know.
+        options: options of sbatch by name; empty values for flags. Options that sbatch could misread are refused.
     """
     jobs = min(jobs or MOST_JOBS, len(wave.cells))
     cpus = math.ceil(max(cell.resources.cpus for cell in wave.cells)) or 1
@@ -95,9 +91,8 @@ def script(wave: Wave, plan: Path, folder: Path, jobs: int = 0, options: Mapping
 
 def _booked(cells: Sequence[Cell]) -> dict[str, str]:
     """Maximum of each resource over the cells, in whole numbers."""
-    if custom := next((cell for cell in cells if cell.resources.custom), None):
-        name = next(iter(custom.resources.custom))
-        raise UserError(f"resources.{name}: expected {CPUS}, {GPUS} or {MEMORY}, which Slurm knows; name others by --sbatch")
+    if custom := [name for cell in cells for name in cell.resources.custom]:
+        raise UserError(f"resources.{custom[0]}: expected {CPUS}, {GPUS} or {MEMORY}, which Slurm knows; name others by --sbatch")
     gpus = math.ceil(max(cell.resources.gpus for cell in cells))
     memory = math.ceil(max(cell.resources.memory_gb for cell in cells) * 1000)
     return ({"gres": f"gpu:{gpus}"} if gpus else {}) | ({"mem": f"{memory}M"} if memory else {})
@@ -105,10 +100,10 @@ def _booked(cells: Sequence[Cell]) -> dict[str, str]:
 
 def _checked(options: Mapping[str, str]) -> dict[str, str]:
     for name, value in options.items():
-        if not _OPTION.fullmatch(name) or name in OWN:
-            raise UserError(f"sbatch: expected options of sbatch without {', '.join(OWN)}, such as partition, found {shown(name)}")
-        if not isinstance(value, str) or not _VALUE.fullmatch(value) or (name == _CPUS and not value.isdigit()):
-            raise UserError(f"sbatch.{name}: expected a value of letters, digits and .,:/@%+=[]*-, found {shown(value)}")
+        allowed = _OPTION.fullmatch(name) and name not in RESERVED
+        require(allowed, "sbatch", f"options of sbatch without {', '.join(RESERVED)}, such as partition", shown(name))
+        readable = isinstance(value, str) and _VALUE.fullmatch(value) and (name != _CPUS or value.isdigit())
+        require(readable, f"sbatch.{name}", "a value of letters, digits and .,:/@%+=[]*-", shown(value))
     return dict(options)
 
 
@@ -127,14 +122,10 @@ def write_scripts(
         stages: stages of the plan.
         plan: the cells of each stage by its number.
         keys: keys of the plan's file beside the stages: results, seeds, root.
-        jobs: number of jobs of each array; 0 for a job per cell.
-        options: options of sbatch.
+        jobs, options: as in :func:`script`.
 
     Returns:
         The submit commands, in order.
-
-    Raises:
-        UserError: as :func:`script`; nothing is written.
     """
     file, folder = Path(file), Path.cwd()
     written = folder / f"{file}.yaml"

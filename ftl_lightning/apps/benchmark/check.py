@@ -1,17 +1,18 @@
-"""Check a submission: its form, completeness and consistency, and a part of its numbers by running it again.
+"""Check submissions: form, completeness and consistency, and a part of the numbers by running it again.
 
 Only numbers and known names of suites and concepts are read from a file. No code that it names is run: the user names the method.
 """
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
-from ftl_lightning.apps.benchmark.run import SHIPPED, Entry, scored, temporary
-from ftl_lightning.apps.benchmark.submission import FORMAT, GIVEN, KIND, PRETRAINED, Row, Run, Submission, machine
-from ftl_lightning.apps.benchmark.suite import ASKED, SEEDS, TRAINING, BenchmarkSuite, load_suite, suite_names
-from ftl_lightning.services.errors import UserError, about, short
+from ftl_lightning.apps.benchmark.run import SHIPPED, Candidate
+from ftl_lightning.apps.benchmark.submission import FORMAT, GIVEN, KIND, PRETRAINED, Row, Run, Submission, machine, scored
+from ftl_lightning.apps.benchmark.suite import REQUIRED, SEEDS, TRAINING, BenchmarkSuite, load_suite, suite_names
+from ftl_lightning.services.errors import about, require, short
 from ftl_lightning.services.printing import say
 from ftl_lightning.services.tensor_file import content_hash
 from ftl_lightning.training.method import code_hash, load_method
@@ -24,224 +25,188 @@ ROUNDING = 2e-6
 """Tolerance for values rounded to six decimals."""
 ERRORS = 3
 """Tolerance of rates in standard errors on another machine, where learning amplifies rounding."""
-LEAST, MOST = 0.0, 1.0
+MOST_REFERENCES = 20
 
 
 def check_submission(path: Path) -> tuple[Submission, dict[str, BenchmarkSuite]]:
-    """Read a submission and check its completeness and its agreement with itself and the frozen suites.
+    """Read a submission, and check its completeness and its agreement with itself and the frozen suites.
 
     Returns:
         The submission, and its suites by name.
 
     Raises:
-        UserError: naming the file and the first error, with expected and actual value.
+        UserError: naming the file and the first error.
     """
     submission = Submission.load(path)
     with about(path):
-        _expect_header(submission)
-        suites = {name: _expect_suite(submission, name) for name in submission.suites}
-        _expect_runs(submission, suites)
-        _expect_scores(submission)
+        _check_header(submission)
+        suites = {name: load_suite(name) for name in submission.suites}
+        for name, suite in suites.items():
+            given = submission.suites[name]
+            require(given == suite.hash, f"suites.{short(name)}", f"the frozen suite's hash {suite.hash}", short(given))
+        runs: dict[tuple[str, int], Run] = {}
+        for index, run in enumerate(submission.runs):
+            key, where = f"runs[{index}]", f"{run.suite}, seed {run.seed}"
+            require(run.suite in suites, f"{key}.suite", f"one of {', '.join(suites)}", run.suite)
+            require(run.seed in submission.seeds, f"{key}.seed", f"one of {list(submission.seeds)}", run.seed)
+            require((run.suite, run.seed) not in runs, key, f"one run of {where}", "two")
+            runs[run.suite, run.seed] = run
+            _check_run(run, suites[run.suite], where)
+        for name in suites:
+            for seed in submission.seeds:
+                require((name, seed) in runs, "runs", f"one of {name}, seed {seed}", "none")
+        _check_scores(submission)
     return submission, suites
 
 
-def _expect(good: bool, key: str, expected: object, value: object) -> None:
-    if not good:
-        raise UserError(f"{key}: expected {expected}, found {short(str(value), 80)}")
-
-
-def _expect_header(submission: Submission) -> None:
-    _expect(submission.kind == KIND, "kind", repr(KIND), repr(submission.kind))
-    _expect(submission.format == FORMAT, "format", FORMAT, submission.format)
+def _check_header(submission: Submission) -> None:
+    require(submission.kind == KIND, "kind", repr(KIND), repr(short(submission.kind)))
+    require(submission.format == FORMAT, "format", str(FORMAT), submission.format)
     for key in ("method", "name"):
         value = getattr(submission, key)
-        _expect(NAME.fullmatch(value) is not None, key, "letters, digits and a few signs, at most 60", repr(value))
-    _expect(tuple(submission.seeds) == SEEDS, "seeds", list(SEEDS), list(submission.seeds))
-    _expect(bool(submission.suites), "suites", f"some of {', '.join(suite_names())}", "none")
-    _expect(not submission.code or HASH.fullmatch(submission.code) is not None, "code", "a hash of 16 digits", "another text")
+        require(NAME.fullmatch(value), key, "letters, digits and a few signs, at most 60", short(value))
+    require(tuple(submission.seeds) == SEEDS, "seeds", str(list(SEEDS)), list(submission.seeds))
+    require(submission.suites, "suites", f"some of {', '.join(suite_names())}", "none")
+    require(not submission.code or HASH.fullmatch(submission.code), "code", "a hash of 16 digits", "another text")
     for key, value in submission.machine.items():
-        _expect(len(key) + len(value) <= 200, "machine", "short texts", f"{len(key) + len(value)} characters")
+        require(len(key) + len(value) <= 200, "machine", "short texts", f"{len(key) + len(value)} characters")
 
 
-def _expect_suite(submission: Submission, name: str) -> BenchmarkSuite:
-    suite = load_suite(name)
-    _expect(
-        submission.suites[name] == suite.hash,
-        f"suites.{short(name)}",
-        f"the frozen suite's hash {suite.hash}",
-        submission.suites[name],
-    )
-    return suite
-
-
-def _expect_runs(submission: Submission, suites: Mapping[str, BenchmarkSuite]) -> None:
-    seen = set()
-    for index, run in enumerate(submission.runs):
-        key = f"runs[{index}]"
-        _expect(run.suite in suites, f"{key}.suite", f"one of {', '.join(suites)}", repr(run.suite))
-        _expect(run.seed in submission.seeds, f"{key}.seed", f"one of {list(submission.seeds)}", run.seed)
-        where = f"{run.suite}, seed {run.seed}"
-        _expect((run.suite, run.seed) not in seen, key, f"one run of {where}", "two")
-        seen.add((run.suite, run.seed))
-        _expect_run(run, suites[run.suite], where)
-    for name in suites:
-        for seed in submission.seeds:
-            _expect((name, seed) in seen, "runs", f"one of {name}, seed {seed}", "none")
-
-
-def _expect_run(run: Run, suite: BenchmarkSuite, where: str) -> None:
-    for key, value in (("model", run.model), ("configuration", run.configuration)):
-        _expect(HASH.fullmatch(value) is not None, f"{where}: {key}", "a hash of 16 digits", repr(value))
-    _expect(run.origin in (PRETRAINED, GIVEN), f"{where}: origin", f"{PRETRAINED} or {GIVEN}", repr(run.origin))
-    known = suite.data.get(str(run.seed), {})
-    parts = [part for part in known if part in ((TRAINING, *ASKED) if run.origin == PRETRAINED else ASKED)]
+def _check_run(run: Run, suite: BenchmarkSuite, where: str) -> None:
+    for key in ("model", "configuration"):
+        value = getattr(run, key)
+        require(HASH.fullmatch(value), f"{where}: {key}", "a hash of 16 digits", short(value))
+    require(run.origin in (PRETRAINED, GIVEN), f"{where}: origin", f"{PRETRAINED} or {GIVEN}", short(run.origin))
+    known, drawn_parts = suite.data.get(str(run.seed), {}), (TRAINING, *REQUIRED) if run.origin == PRETRAINED else REQUIRED
+    parts = [part for part in known if part in drawn_parts]
     for part in parts:
-        value = run.data.get(part, "none")
-        _expect(value == known[part].hash, f"{where}: data.{part}", f"the frozen data's hash {known[part].hash}", value)
-    _expect(set(run.data) == set(parts), f"{where}: data", ", ".join(parts) or "nothing", ", ".join(run.data))
-    for key, seconds in (("seconds", run.seconds), ("pretraining_seconds", run.pretraining_seconds)):
-        _expect(seconds >= 0, f"{where}: {key}", "0 or more", seconds)
-    _expect_rows(run.rows, suite, where, tuple(suite.measures))
-    _expect(len(run.references) <= 20, f"{where}: references", "at most 20", len(run.references))
+        value = short(run.data.get(part, "none"))
+        require(value == known[part].hash, f"{where}: data.{part}", f"the frozen data's hash {known[part].hash}", value)
+    require(set(run.data) == set(parts), f"{where}: data", ", ".join(parts) or "nothing", short(", ".join(run.data)))
+    for key in ("seconds", "pretraining_seconds"):
+        seconds = getattr(run, key)
+        require(seconds >= 0, f"{where}: {key}", "0 or more", seconds)
+    _check_rows(run.rows, suite, where, suite.measures)
+    require(len(run.references) <= MOST_REFERENCES, f"{where}: references", f"at most {MOST_REFERENCES}", len(run.references))
     for name, rows in run.references.items():
-        _expect(NAME.fullmatch(name) is not None, f"{where}: references", "names of reference lines", repr(name))
-        _expect_rows(rows, suite, f"{where}, {name}", (suite.headline,))
+        require(NAME.fullmatch(name), f"{where}: references", "names of reference policies", short(name))
+        _check_rows(rows, suite, f"{where}, {name}", {suite.headline})
 
 
-def _expect_rows(rows: Sequence[Row], suite: BenchmarkSuite, where: str, measures: Sequence[str]) -> None:
-    """Check that each concept of the test occurs once, with the measures and the suite's number of samples."""
+def _check_rows(rows: Sequence[Row], suite: BenchmarkSuite, where: str, needed: Iterable[str]) -> None:
+    """Check that each concept of the test occurs once, with the needed measures and the suite's number of samples."""
     tasks = [(task.setting, task.concept) for task in suite.test]
     measured = [(row.setting, row.concept) for row in rows]
     for task in tasks:
         count = measured.count(task)
-        _expect(count == 1, f"{where}: rows", f"one of {task[1]!r} ({task[0]})", count or "none")
+        require(count == 1, f"{where}: rows", f"one of {task[1]!r} ({task[0]})", count or "none")
     for row in rows:
-        _expect((row.setting, row.concept) in tasks, f"{where}: rows", "concepts of the test alone", repr(row.concept))
         place = f"{where}, {short(row.concept, 40)}"
-        _expect(row.n == suite.samples, f"{place}: n", suite.samples, row.n)
-        _expect(
-            set(measures) <= set(row.measures) <= set(suite.measures),
-            f"{place}: measures",
-            ", ".join(measures),
-            ", ".join(row.measures),
-        )
+        require((row.setting, row.concept) in tasks, f"{where}: rows", "concepts of the test alone", short(row.concept))
+        require(row.n == suite.samples, f"{place}: n", str(suite.samples), row.n)
+        complete = set(needed) <= set(row.measures) <= set(suite.measures)
+        require(complete, f"{place}: measures", ", ".join(needed), short(", ".join(row.measures)))
         for name, value in row.measures.items():
-            rate = suite.is_rate(name)
-            _expect(value >= LEAST and (not rate or value <= MOST), f"{place}: {name}", "0 to 1" if rate else "0 or more", value)
+            rate, key = suite.is_rate(name), f"{place}: {name}"
+            require(value >= 0 and (value <= 1 or not rate), key, "0 to 1" if rate else "0 or more", value)
             whole = abs(value * row.n - round(value * row.n)) <= row.n * ROUNDING
-            _expect(not rate or whole, f"{place}: {name}", f"a whole number of {row.n} samples", value)
+            require(whole or not rate, key, f"a whole number of {row.n} samples", value)
 
 
-def _expect_scores(submission: Submission) -> None:
+def _check_scores(submission: Submission) -> None:
     expected = scored(submission).scores
-    _expect(set(submission.scores) == set(expected), "scores", ", ".join(expected), ", ".join(submission.scores))
+    require(set(submission.scores) == set(expected), "scores", ", ".join(expected), short(", ".join(submission.scores)))
     for name, score in expected.items():
         submitted = submission.scores[name]
-        _expect(submitted.concepts == score.concepts, f"scores.{name}.concepts", score.concepts, submitted.concepts)
+        require(submitted.concepts == score.concepts, f"scores.{name}.concepts", str(score.concepts), submitted.concepts)
         for key in ("mean", "error"):
-            mine, theirs = getattr(score, key), getattr(submitted, key)
-            _expect(abs(mine - theirs) <= ROUNDING, f"scores.{name}.{key}", f"{mine}, which the rows come to", theirs)
+            computed, given = getattr(score, key), getattr(submitted, key)
+            require(abs(computed - given) <= ROUNDING, f"scores.{name}.{key}", f"{computed}, computed from the rows", given)
 
 
 def drawn(submission: Submission, share: float, salt: str) -> list[Run]:
-    """The runs to run again, with at least a share of all rows.
+    """Draw the runs to run again, with at least a share of all rows.
 
-    The draw depends on a hash of the file and a word of the checker: without the word, a file cannot be tuned to a favourable
-    draw.
-
-    Args:
-        submission: the checked submission.
-        share: share of its rows, 0 for none.
-        salt: the word; may be empty.
+    The draw depends on a hash of the file and a word of the checker, ``salt``: who does not know the word cannot tune a file to a
+    favourable draw.
     """
-    whole = submission.hash
-    order = sorted(submission.runs, key=lambda run: content_hash([salt, whole, run.suite, run.seed]))
-    wanted = share * sum(len(run.rows) for run in submission.runs)
+    file_hash = submission.hash
+    order = sorted(submission.runs, key=lambda run: content_hash([salt, file_hash, run.suite, run.seed]))
+    least = share * sum(len(run.rows) for run in submission.runs)
     runs: list[Run] = []
-    while sum(len(run.rows) for run in runs) < wanted:
+    while sum(len(run.rows) for run in runs) < least:
         runs.append(order[len(runs)])
     return runs
 
 
-@dataclass(frozen=True)
-class Difference:
-    """A number that was not reproduced."""
-
-    run: Run
-    where: str
-    submitted: object
-    found: object
-
-    def __str__(self) -> str:
-        return f"{self.run.suite}, seed {self.run.seed}, {short(self.where, 80)}: submitted {self.submitted}, found {self.found}"
-
-
-def allowed(submitted: float, found: float, n: int, rate: bool, alike: bool) -> bool:
+def allowed(submitted: float, repeated: float, n: int, rate: bool, alike: bool) -> bool:
     """Whether a number was reproduced: exactly on a machine of the same kind, else approximately.
 
     Args:
-        submitted, found: the numbers.
+        submitted, repeated: the numbers.
         n: number of samples.
-        rate: whether the numbers are shares; other numbers may differ by a fifth on another machine.
+        rate: whether the numbers are fractions of the samples; other numbers may differ by a fifth on another machine.
         alike: whether processor, versions and threads are the same.
     """
-    apart = abs(submitted - found)
-    if apart <= ROUNDING:
-        return True
-    if alike:
-        return False
+    difference = abs(submitted - repeated)
+    if alike or difference <= ROUNDING:
+        return difference <= ROUNDING
     if not rate:
-        return apart <= 0.2 * max(submitted, found)
+        return difference <= 0.2 * max(submitted, repeated)
     # Keep the standard error above 0 when all samples are right or wrong.
-    mean = min(max((submitted + found) / 2, 1 / n), 1 - 1 / n)
-    return apart <= ERRORS * (2 * mean * (1 - mean) / n) ** 0.5
+    mean = min(max((submitted + repeated) / 2, 1 / n), 1 - 1 / n)
+    return difference <= ERRORS * (2 * mean * (1 - mean) / n) ** 0.5
 
 
-def differences(run: Run, again: Run, suite: BenchmarkSuite, alike: bool) -> Iterator[Difference]:
-    """Differences between a submitted run and the same run here."""
+def differences(run: Run, again: Run, suite: BenchmarkSuite, alike: bool) -> Iterator[str]:
+    """Differences between a submitted run and the same run here, in words."""
+
+    def difference(where: str, submitted: object, repeated: object) -> str:
+        return f"{run.suite}, seed {run.seed}, {short(where, 80)}: submitted {submitted}, found {repeated}"
+
     if alike and run.configuration != again.configuration:
-        yield Difference(run, "configuration", run.configuration, again.configuration)
+        yield difference("configuration", run.configuration, again.configuration)
     if (alike or again.origin == GIVEN) and run.model != again.model:
-        yield Difference(run, "model", run.model, again.model)
-    pairs = [("", run.rows, again.rows), *((name, rows, again.references.get(name, ())) for name, rows in run.references.items())]
-    for name, rows, repeated in pairs:
-        known = {(row.setting, row.concept): row for row in repeated}
+        yield difference("model", run.model, again.model)
+    for name, rows in {"": run.rows, **run.references}.items():
+        repeated_rows = again.references.get(name, ()) if name else again.rows
+        known = {(row.setting, row.concept): row.measures for row in repeated_rows}
         for row in rows:
-            repeat = known.get((row.setting, row.concept))
+            repeated = known.get((row.setting, row.concept), {})
             for measure, value in row.measures.items():
                 where = ", ".join(filter(None, (name, row.concept, measure)))
-                if repeat is None or measure not in repeat.measures:
-                    yield Difference(run, where, value, "none")
-                elif not allowed(value, repeat.measures[measure], row.n, suite.is_rate(measure), alike):
-                    yield Difference(run, where, value, repeat.measures[measure])
+                if measure not in repeated:
+                    yield difference(where, value, "none")
+                elif not allowed(value, repeated[measure], row.n, suite.is_rate(measure), alike):
+                    yield difference(where, value, repeated[measure])
 
 
 def recompute(
-    entry: Entry, submission: Submission, suites: Mapping[str, BenchmarkSuite], share: float, salt: str
-) -> list[Difference]:
+    candidate: Candidate, submission: Submission, suites: Mapping[str, BenchmarkSuite], share: float, salt: str
+) -> list[str]:
     """Run a part of a submission again and return the differences.
 
     Raises:
         UserError: for another method, or one that cannot be run here.
     """
-    method = load_method(entry.method)
-    if method.name != submission.name:
-        raise UserError(f"method: expected {submission.method!r}, which the submission is of, found {entry.method!r}")
-    if submission.code != code_hash(entry.method):
+    method = load_method(candidate.method)
+    expected = f"{submission.method!r}, the method of the submission"
+    require(method.name == submission.name, "method", expected, repr(candidate.method))
+    if submission.code != code_hash(candidate.method):
         say("note: the method's code is not that of the submission", error=True)
     alike = dict(submission.machine) == machine() and submission.version == __version__
     chosen = drawn(submission, share, salt)
-    differing: list[Difference] = []
+    all_differences: list[str] = []
     count, total = (sum(len(run.rows) for run in runs) for runs in (chosen, submission.runs))
     say(f"running {len(chosen)} of {len(submission.runs)} runs again, {count} of {total} rows")
     if not alike:
         say("note: another machine or version: rates may differ by three standard errors, as rounding does", error=True)
-    with temporary(entry) as copy:
+    with TemporaryDirectory() as work:
         for run in chosen:
             # Given models default to the shipped models.
-            same = replace(copy, model=SHIPPED) if run.origin == GIVEN and not copy.model else copy
-            again = same.run(suites[run.suite], run.seed)
-            differ = list(differences(run, again, suites[run.suite], alike))
-            say(f"{run.suite}, seed {run.seed}: {f'{len(differ)} numbers differ' if differ else 'the same'}")
-            differing += differ
-    return differing
+            model = SHIPPED if run.origin == GIVEN and not candidate.model else candidate.model
+            again = replace(candidate, model=model, work=Path(work)).run(suites[run.suite], run.seed)
+            found = list(differences(run, again, suites[run.suite], alike))
+            say(f"{run.suite}, seed {run.seed}: {f'{len(found)} numbers differ' if found else 'the same'}")
+            all_differences += found
+    return all_differences

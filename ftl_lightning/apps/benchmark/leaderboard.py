@@ -4,10 +4,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from ftl_lightning.apps.benchmark.check import check_submission
-from ftl_lightning.apps.benchmark.run import references_of
 from ftl_lightning.apps.benchmark.submission import GIVEN, Row, Run, Score, Submission, score
 from ftl_lightning.apps.benchmark.suite import BenchmarkSuite, load_suite, suite_names
-from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.errors import require
 from ftl_lightning.services.escape import markdown
 from ftl_lightning.services.tensor_file import visible
 
@@ -46,13 +45,11 @@ def read_submissions(folder: Path) -> list[Submission]:
         UserError: for the first invalid file, two submissions of a method, or a folder without submissions.
     """
     files = visible(folder, "*.json") if folder.is_dir() else []
-    if not files:
-        raise UserError(f"{folder}: expected a folder of submissions (.json), found none")
+    require(files, str(folder), "a folder of submissions (.json)", "none")
     known: dict[str, Submission] = {}
     for path in files:
         submission, _ = check_submission(path)
-        if submission.name in known:
-            raise UserError(f"{path}: expected one submission of {submission.name!r}, found two; remove one")
+        require(submission.name not in known, str(path), f"one submission of {submission.name!r}", "two; remove one")
         known[submission.name] = submission
     return [known[name] for name in sorted(known)]
 
@@ -79,7 +76,7 @@ def _section(suite: BenchmarkSuite, submissions: Sequence[Submission]) -> str:
 
 
 def _lines(suite: BenchmarkSuite, runs: Mapping[str, Sequence[Run]]) -> Iterator[tuple[float, list[str]]]:
-    """Score and cells of each line: methods, then reference lines of the first submission with them."""
+    """Score and cells of each line: methods, then reference policies of the first submission with them."""
     others = [name for name in suite.measures if name != suite.headline]
     for name, group in runs.items():
         rows = [run.rows for run in group]
@@ -91,12 +88,13 @@ def _lines(suite: BenchmarkSuite, runs: Mapping[str, Sequence[Run]]) -> Iterator
             main.mean,
             [f"**{markdown(name)}**", _shown(main), *(_shown(score(suite, rows, measure)) for measure in others), model, *times],
         )
-    lines: dict[str, Sequence[Sequence[Row]]] = {}
-    for references in references_of(runs).values():
-        lines = references | lines
-    for name, known in lines.items():
+    references: dict[str, list[Sequence[Row]]] = {}
+    for group in runs.values():
+        common = set.intersection(*(set(run.references) for run in group))
+        references = {name: [run.references[name] for run in group] for name in sorted(common)} | references
+    for name, known in references.items():
         main = score(suite, known)
-        measured = set.intersection(*({*row.measures} for rows_of_seed in known for row in rows_of_seed))
+        measured = set.intersection(*({*row.measures} for seed_rows in known for row in seed_rows))
         cells = [_shown(score(suite, known, measure)) if measure in measured else "-" for measure in others]
         yield main.mean, [f"*{markdown(name)}*", _shown(main), *cells, "-", "-", "-"]
 

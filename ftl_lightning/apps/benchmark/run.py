@@ -1,9 +1,7 @@
 """Run a method through suites: pretraining, learning and evaluation by the cells of ablations."""
 
-import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,12 +10,12 @@ import yaml
 
 from ftl_lightning.apps.ablation.plan import Cell
 from ftl_lightning.apps.ablation.run import attempt
-from ftl_lightning.apps.benchmark.submission import GIVEN, PRETRAINED, Row, Run, Submission, score
-from ftl_lightning.apps.benchmark.suite import ASKED, TRAINING, BenchmarkSuite, load_suite
+from ftl_lightning.apps.benchmark.submission import GIVEN, PRETRAINED, Row, Run, Submission, scored
+from ftl_lightning.apps.benchmark.suite import REQUIRED, TRAINING, BenchmarkSuite, load_suite
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.evaluation.row import METHOD, REFERENCE
 from ftl_lightning.services.configuration import load
-from ftl_lightning.services.errors import UserError, about, short
+from ftl_lightning.services.errors import UserError, about, require, short
 from ftl_lightning.services.printing import say
 from ftl_lightning.services.progress import bar
 from ftl_lightning.services.shipped import pretrained_folder, shipped
@@ -30,14 +28,13 @@ if TYPE_CHECKING:
 
 SHIPPED = "shipped"
 """Value of ``model`` for the models that the method's configurations name."""
-OURS = Path(__file__).parent / "configurations"
-"""Configurations of our methods for the families, which ``conf`` lacks."""
-KEPT_CONFIGURATION = "configuration.yaml"
+CONFIGURATIONS = Path(__file__).parent / "configurations"
+"""Configurations of the package's methods for the families."""
 
 
 @dataclass(frozen=True)
-class Entry:
-    """A method with its models and configurations.
+class Candidate:
+    """Method with its models and configurations.
 
     Attributes:
         method: registered name of the method.
@@ -68,11 +65,11 @@ class Entry:
         """
         folder = self.configurations or self.declared.configurations
         places = [Path(folder) / f"{suite.name}.yaml", Path(folder) / "suites.yaml"] if folder else []
-        places += [] if self.configurations else [OURS / f"{self.method}.yaml"]
+        places += [] if self.configurations else [CONFIGURATIONS / f"{self.method}.yaml"]
         if (file := next((path for place in places if (path := shipped(place)).is_file()), None)) is not None:
             return file
-        if self.configurations:
-            raise UserError(f"configurations: expected {suite.name}.yaml or suites.yaml in {short(folder, 80)}, found neither")
+        expected = f"{suite.name}.yaml or suites.yaml in {short(folder, 80)}"
+        require(not self.configurations, "configurations", expected, "neither")
         return self._written(suite)
 
     def configurations_of(self, suite: BenchmarkSuite) -> tuple[str, ...]:
@@ -91,10 +88,10 @@ class Entry:
 
     def _written(self, suite: BenchmarkSuite) -> Path:
         """Write a configuration with the defaults of the method's classes."""
-        method, path = self.declared, self.work / f"{suite.name}-{KEPT_CONFIGURATION}"
+        method, path = self.declared, self.work / f"{suite.name}-configuration.yaml"
         content: dict[str, Any] = {
             "defaults": ["conf/verb.yaml"],
-            "data": {"init_args": {"domain": suite.domain}},
+            "data": {"init_args": {"domain": suite.domain_reference}},
             "fit": {
                 "model": {"class_path": class_path(method.pretraining())} if method.pretraining else {},
                 "data": {"class_path": "ftl_lightning.training.data.PretrainingData"},
@@ -117,22 +114,20 @@ class Entry:
             place = str(options.get("pretrained") or "")
         else:
             place = self.model.replace("{suite}", suite.name).replace("{seed}", str(seed))
-        if not place or not (pretrained_folder(place) / CONFIG).is_file():
-            raise UserError(
-                f"model: expected a pretrained model for suite {suite.name}, found none in {short(place, 80) or SHIPPED!r}"
-            )
+        there = place and (pretrained_folder(place) / CONFIG).is_file()
+        require(there, "model", f"a pretrained model for suite {suite.name}", f"none in {short(place, 80) or SHIPPED!r}")
         return pretrained_folder(place)
 
     def cells(self, suite: BenchmarkSuite, seed: int) -> tuple[Cell | None, Cell]:
         """The cells ``fit``, unless a model is given, and ``invert``; frozen values of the suite override the method's."""
         method = self.declared
-        if not method.pretraining and not self.model:
-            raise UserError(f"model: expected models of kind {method.kind}, which {method.name} does not pretrain, found none")
+        expected = f"models of kind {method.kind}, which {method.name} does not pretrain"
+        require(method.pretraining or self.model, "model", expected, "none")
         files, model = self.configurations_of(suite), self.trained(suite, seed)
         name = f"{suite.name}, seed {seed}"
         shared = {
             "seed_everything": str(seed),
-            "data.domain": suite.domain,
+            "data.domain": suite.domain_reference,
             "data.seed": str(seed),
             "trainer.enable_progress_bar": "false",
             "trainer.logger.init_args.save_dir": str(self.work / "logs"),
@@ -145,7 +140,7 @@ class Entry:
         fit = {"model.output": str(model), "data.samples_per_concept": str(suite.training.count), "data.more": "null"}
         fit |= {"data.recoveries": str(suite.training.recoveries), "evaluation.samples": "10"}
         # Families have no domain table of embeddings.
-        fit |= {} if load_domain(suite.domain).concepts.table else {"data.encoder": "hashing"}
+        fit |= {} if load_domain(suite.domain_reference).concepts.table else {"data.encoder": "hashing"}
         invert = {
             "model.pretrained": str(model),
             "data.suite": suite.test_suite,
@@ -167,18 +162,17 @@ class Entry:
         Raises:
             UserError: if the data differ from the frozen data, or the method cannot be run.
         """
-        parts = ASKED if self.model else (TRAINING, *ASKED)
+        parts = REQUIRED if self.model else (TRAINING, *REQUIRED)
         if not suite.check_data(seed, self.root, parts):
             say(f"note: suite {suite.name}, seed {seed}: this processor rounds the data in another way", error=True)
         fit, invert = self.cells(suite, seed)
         start = time.monotonic()
-        if fit is not None and (failed := attempt(fit, set()).error):
-            raise UserError(f"suite {suite.name}, seed {seed}, pretraining: {failed}")
+        if fit is not None and (error := attempt(fit, set()).error):
+            raise UserError(f"suite {suite.name}, seed {seed}, pretraining: {error}")
         fitted = time.monotonic()
         outcome = attempt(invert, set())
-        if outcome.error or outcome.rows is None:
+        if (rows := outcome.rows) is None:
             raise UserError(f"suite {suite.name}, seed {seed}: {outcome.error or 'expected rows, found none'}")
-        rows = outcome.rows
         method_rows = rows[rows["role"] == METHOD]
         measured = _rows(suite, method_rows)
         tasks = {(task.setting, task.concept) for task in suite.test}
@@ -195,19 +189,13 @@ class Entry:
             references={
                 str(name): _rows(suite, group, suite.headline)
                 for name, group in rows[rows["role"] == REFERENCE].groupby("method", sort=True)
-                if tasks <= _measured(group, suite.headline)
+                if tasks <= {*group.loc[group["metric"] == suite.headline, ["setting", "task"]].itertuples(index=False, name=None)}
             },
         )
 
 
-def _measured(table: "pd.DataFrame", measure: str) -> set[tuple[str, str]]:
-    """Settings and concepts with a measure; some reference lines exist for some settings only."""
-    rows = table[table["metric"] == measure]
-    return {*zip(rows["setting"], rows["task"], strict=True)}
-
-
-def _rows(suite: BenchmarkSuite, table: "pd.DataFrame", *least: str) -> list[Row]:
-    """Rows of the test's concepts; of the suite's measures only ``least`` are required, by default all.
+def _rows(suite: BenchmarkSuite, table: "pd.DataFrame", *needed: str) -> list[Row]:
+    """Rows of the test's concepts; of the suite's measures only ``needed`` are required, by default all.
 
     Raises:
         UserError: naming the missing concept and measure.
@@ -218,21 +206,14 @@ def _rows(suite: BenchmarkSuite, table: "pd.DataFrame", *least: str) -> list[Row
         values = {
             str(name): float(value) for name, value in zip(group["metric"], group["value"], strict=True) if name in suite.measures
         }
-        if missing := [name for name in (least or suite.measures) if name not in values]:
+        if missing := [name for name in (needed or suite.measures) if name not in values]:
             raise UserError(f"suite {suite.name}, concept {task.concept!r}: expected the measure {missing[0]}, found none")
-        n = int(group["n"].iloc[0])
-        rows.append(
-            Row(
-                setting=task.setting,
-                concept=task.concept,
-                n=n,
-                measures={name: values[name] for name in suite.measures if name in values},
-            )
-        )
+        measures = {name: values[name] for name in suite.measures if name in values}
+        rows.append(Row(setting=task.setting, concept=task.concept, n=int(group["n"].iloc[0]), measures=measures))
     return rows
 
 
-def run_benchmark(entry: Entry, begun: Submission, names: Sequence[str], out: Path) -> Submission:
+def run_benchmark(candidate: Candidate, begun: Submission, names: Sequence[str], out: Path) -> Submission:
     """Run the missing suites and seeds of a submission; the file is written after each run.
 
     Raises:
@@ -244,7 +225,7 @@ def run_benchmark(entry: Entry, begun: Submission, names: Sequence[str], out: Pa
     with bar("cells", len(missing), lines=False) as advance:
         for number, (suite, seed) in enumerate(missing, 1):
             try:
-                run = entry.run(suite, seed)
+                run = candidate.run(suite, seed)
             except UserError as error:  # other suites still run
                 failed.append(str(error))
                 say(f"[{number}/{len(missing)}] failed: {error}")
@@ -259,23 +240,6 @@ def run_benchmark(entry: Entry, begun: Submission, names: Sequence[str], out: Pa
     return submission
 
 
-def scored(submission: Submission) -> Submission:
-    """Add the scores of complete suites."""
-    scores = {}
-    for name in submission.suites:
-        runs = [run for seed in submission.seeds if (run := submission.run(name, seed)) is not None]
-        if len(runs) == len(submission.seeds):
-            scores[name] = score(load_suite(name), [run.rows for run in runs])
-    return replace(submission, scores=scores)
-
-
-@contextmanager
-def temporary(entry: Entry) -> Iterator[Entry]:
-    """The entry with a temporary work folder."""
-    with tempfile.TemporaryDirectory() as folder:
-        yield replace(entry, work=Path(folder))
-
-
 def missing_of(suite: BenchmarkSuite, root: Path | None, method: str = "") -> str:
     """Why a suite cannot be run here (by a method, if named); empty if it can."""
     if suite.recordings and root is None:
@@ -288,12 +252,3 @@ def missing_of(suite: BenchmarkSuite, root: Path | None, method: str = "") -> st
     except UserError as error:
         return str(error)
     return ""
-
-
-def references_of(runs: Mapping[str, Sequence[Run]]) -> dict[str, dict[str, Sequence[Sequence[Row]]]]:
-    """Rows of the reference lines of each seed, by suite and name, if all seeds have them."""
-    references: dict[str, dict[str, Sequence[Sequence[Row]]]] = {}
-    for suite, suite_runs in runs.items():
-        names = set.intersection(*({*run.references} for run in suite_runs)) if suite_runs else set()
-        references[suite] = {name: [run.references[name] for run in suite_runs] for name in sorted(names)}
-    return references

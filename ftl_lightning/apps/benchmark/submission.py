@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from ftl_lightning.apps.benchmark.suite import BenchmarkSuite
+from ftl_lightning.apps.benchmark.suite import BenchmarkSuite, load_suite
 from ftl_lightning.services.errors import about
 from ftl_lightning.services.limits import check_readable
 from ftl_lightning.services.schema import from_mapping, read_json
@@ -40,7 +40,7 @@ class Row:
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """A run of a suite with a seed.
+    """Run of a suite with a seed.
 
     Attributes:
         suite, seed: suite and seed.
@@ -50,7 +50,7 @@ class Run:
         configuration: hash of the whole configuration.
         pretraining_seconds, seconds: duration of pretraining (0 for a given model), and of learning with evaluation.
         rows: rows of the method, one for each concept of the test.
-        references: rows of the reference lines by name, if the suite has them.
+        references: rows of the reference policies by name, if the suite has them.
     """
 
     suite: str
@@ -138,8 +138,11 @@ def machine() -> dict[str, str]:
     """Processor, system, Python, torch and threads, on which numbers depend; no name of a computer or person."""
     import torch
 
+    file = Path("/proc/cpuinfo")
+    lines = file.read_text("utf-8", errors="replace").splitlines() if file.is_file() else []
+    models = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
     return {
-        "processor": _processor(),
+        "processor": next(models, platform.processor() or "unknown"),
         "cores": str(os.cpu_count()),
         "threads": str(torch.get_num_threads()),
         "system": f"{platform.system()} {platform.machine()}",
@@ -148,32 +151,24 @@ def machine() -> dict[str, str]:
     }
 
 
-def _processor() -> str:
-    """Name of the processor, if known."""
-    about_it = Path("/proc/cpuinfo")
-    lines = about_it.read_text("utf-8", errors="replace").splitlines() if about_it.is_file() else []
-    named = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    return next(named, platform.processor() or "unknown")
-
-
-def by_concept(suite: BenchmarkSuite, rows: Sequence[Sequence[Row]], measure: str) -> list[float]:
-    """Mean of a measure over seeds for each concept of the test, in the suite's order.
-
-    Args:
-        suite: the suite.
-        rows: rows of all concepts, by seed.
-        measure: name of the measure.
-    """
-    values: dict[tuple[str, str], list[float]] = {(row.setting, row.concept): [] for row in rows[0]} if rows else {}
-    for seed_rows in rows:
-        for row in seed_rows:
-            values[row.setting, row.concept].append(row.measures[measure])
-    return [sum(known) / len(known) for task in suite.test if (known := values[task.setting, task.concept])]
-
-
 def score(suite: BenchmarkSuite, rows: Sequence[Sequence[Row]], measure: str = "") -> Score:
     """Score of a suite from the rows of each seed, for its first measure by default."""
-    values = by_concept(suite, rows, measure or suite.headline)
-    count, mean = len(values), sum(values) / len(values)
-    variance = sum((value - mean) ** 2 for value in values) / (count - 1) if count > 1 else 0.0
+    values: dict[tuple[str, str], list[float]] = {}
+    for seed_rows in rows:
+        for row in seed_rows:
+            values.setdefault((row.setting, row.concept), []).append(row.measures[measure or suite.headline])
+    tasks = [values[task.setting, task.concept] for task in suite.test]
+    means = [sum(known) / len(known) for known in tasks]
+    count, mean = len(means), sum(means) / len(means)
+    variance = sum((value - mean) ** 2 for value in means) / (count - 1) if count > 1 else 0.0
     return Score(mean=round(mean, 6), error=round((variance / count) ** 0.5, 6), concepts=count)
+
+
+def scored(submission: Submission) -> Submission:
+    """Add the scores of complete suites."""
+    scores = {}
+    for name in submission.suites:
+        runs = [run for seed in submission.seeds if (run := submission.run(name, seed)) is not None]
+        if len(runs) == len(submission.seeds):
+            scores[name] = score(load_suite(name), [run.rows for run in runs])
+    return dataclasses.replace(submission, scores=scores)

@@ -1,6 +1,7 @@
-"""Frozen suites: training data, test tasks and measures, with hashes of all generated data."""
+"""Frozen suites: training data, test tasks and measures, with hashes of all generated data; export of the data."""
 
-from collections.abc import Iterator, Mapping, Sequence
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -9,27 +10,34 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.data.demonstrations import Demonstrations, concatenate
-from ftl_lightning.domains.domain import Domain, Recoveries, Source
+from ftl_lightning.domains.domain import Domain, Recoveries
 from ftl_lightning.domains.registry import load_domain
-from ftl_lightning.services.errors import UserError, about, short
+from ftl_lightning.services.errors import UserError, about, require, short
 from ftl_lightning.services.schema import from_mapping, read_json
 from ftl_lightning.services.seeding import DEMONSTRATION_SEED, EVALUATION_SEED
-from ftl_lightning.services.tensor_file import bytes_hash, file_hash
+from ftl_lightning.services.tensor_file import bytes_hash, file_hash, write_text
+from ftl_lightning.version import __version__
 
 FOLDER = Path(__file__).parent / "suites"
+FAMILIES = {name: f"{__package__}.families:{name.upper()}" for name in ("beats", "pictures", "reaches", "strokes")}
+"""References ``module:ATTRIBUTE`` of the benchmark's domains by short name: suites' files, which are hashed, name no module."""
 SEEDS = (0, 1, 2)
 """Seeds of the protocol."""
-CLOSE = 1e-3
+TOLERANCE = 1e-3
 """Maximum relative difference of mean and mean square that is due to rounding on another processor."""
 TRAINING, DEMONSTRATIONS, VALIDATION, STARTS = "training", "demonstrations", "validation", "starts"
 """Parts of a suite's data."""
-ASKED = (DEMONSTRATIONS, STARTS)
+REQUIRED = (DEMONSTRATIONS, STARTS)
 """Parts that every run draws, also without pretraining."""
+EXPORTED = (TRAINING, VALIDATION, DEMONSTRATIONS)
+"""Parts that :func:`write_data` writes."""
+FORMATS = ("npz", "safetensors", "lerobot", "minari")
+"""Formats of exported data."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """A test task: a setting and a concept of the domain's test suite."""
+    """Test task: setting and concept of the domain's test suite."""
 
     setting: str
     concept: str
@@ -42,7 +50,7 @@ class Training:
     Attributes:
         concepts: texts of the concepts.
         count: demonstrations per concept.
-        recoveries: additional demonstrations per concept, if it has any, which start from failures.
+        recoveries: maximum number of additional demonstrations per concept, which start from failures.
     """
 
     concepts: Sequence[str]
@@ -51,7 +59,7 @@ class Training:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Print:
+class Fingerprint:
     """Fingerprint of data: the hash of their bytes and, as rounding differs between processors, mean and mean square."""
 
     hash: str
@@ -59,25 +67,25 @@ class Print:
     square: float
 
     @classmethod
-    def of(cls, tensors: Sequence[Tensor], known_by: str) -> "Print":
-        """The fingerprint of tensors with a known hash."""
-        every = torch.cat([tensor.double().flatten() for tensor in tensors])
-        return cls(hash=known_by, mean=float(f"{every.mean():.8g}"), square=float(f"{every.square().mean():.8g}"))
+    def of(cls, tensors: Sequence[Tensor], known_hash: str) -> "Fingerprint":
+        """Fingerprint of tensors with a known hash."""
+        values = torch.cat([tensor.double().flatten() for tensor in tensors])
+        return cls(hash=known_hash, mean=float(f"{values.mean():.8g}"), square=float(f"{values.square().mean():.8g}"))
 
-    def is_near(self, other: "Print") -> bool:
+    def is_near(self, other: "Fingerprint") -> bool:
         """Whether mean and mean square are equal up to rounding."""
         size = max(self.square**0.5, 1e-12)
-        return abs(self.mean - other.mean) <= CLOSE * size and abs(self.square - other.square) <= CLOSE * size**2
+        return abs(self.mean - other.mean) <= TOLERANCE * size and abs(self.square - other.square) <= TOLERANCE * size**2
 
 
 @dataclass(frozen=True, kw_only=True)
 class BenchmarkSuite:
-    """A suite.
+    """Frozen suite.
 
     Attributes:
         name: name of its file.
         title: title in words.
-        domain: name of the domain, or ``module:ATTRIBUTE`` of this package.
+        domain: short name in :data:`FAMILIES`, name of a registered domain, or ``module:ATTRIBUTE``.
         needs: extra with the simulator; empty for none.
         recordings: whether data are read from the user's copy.
         training: pretraining data.
@@ -87,7 +95,7 @@ class BenchmarkSuite:
         demonstrations: demonstrations per new concept.
         samples: samples or episodes per concept.
         closed_loop: whether plans are executed.
-        references: whether reference lines are measured, too; some are slow.
+        references: whether reference policies are measured, too; some are slow.
         measures: kind of each measure by name: a ``rate`` of right samples, or an ``error rate`` or a ``distance``, for which less
             is better; the first measure is the suite's score.
         data: fingerprints of the parts, by seed.
@@ -107,15 +115,15 @@ class BenchmarkSuite:
     closed_loop: bool = False
     references: bool = True
     measures: Mapping[str, Literal["rate", "error rate", "distance"]]
-    data: Mapping[str, Mapping[str, Print]] = field(default_factory=dict)
+    data: Mapping[str, Mapping[str, Fingerprint]] = field(default_factory=dict)
 
     def is_rate(self, measure: str) -> bool:
-        """Whether a measure is a share of samples."""
+        """Whether a measure is a fraction of the samples."""
         return self.measures[measure] != "distance"
 
     @property
     def headline(self) -> str:
-        """The measure that is the suite's score."""
+        """Measure that is the suite's score."""
         return next(iter(self.measures))
 
     @property
@@ -123,65 +131,54 @@ class BenchmarkSuite:
         """16-digit hash of the suite's file."""
         return file_hash(FOLDER / f"{self.name}.json")
 
+    @property
+    def domain_reference(self) -> str:
+        """Name of the domain for :func:`~ftl_lightning.domains.registry.load_domain`."""
+        return FAMILIES.get(self.domain, self.domain)
+
     def loaded(self) -> Domain:
-        """Its domain, checked for the concepts of the suite.
+        """Load the domain, and check that it has the concepts of the suite.
 
         Raises:
             UserError: for another version of the domain, or a missing simulator.
         """
-        domain = load_domain(self.domain)
+        domain = load_domain(self.domain_reference)
         with about(f"suite {self.name}"):
             tasks = {(task.setting, task.name) for task in domain.concepts.suites[self.test_suite].tasks}
-            if (
-                tuple(self.training.concepts) != domain.concepts.training
-                or not {(t.setting, t.concept) for t in self.test} <= tasks
-            ):
+            unchanged = tuple(self.training.concepts) == domain.concepts.training
+            if not unchanged or not {(task.setting, task.concept) for task in self.test} <= tasks:
                 raise UserError(f"expected the concepts of the frozen suite, found others in domain {domain.name}; it was changed")
             if self.closed_loop and domain.closed_loop is not None:
                 domain.closed_loop.expect()
         return domain
 
-    def prints(self, seed: int, root: Path | None, parts: Sequence[str]) -> dict[str, Print]:
-        """Fingerprints of the data of a seed by part, without initial states where there are none."""
-        domain = self.loaded()
-        prints = {}
+    def fingerprints(self, seed: int, root: Path | None, parts: Sequence[str]) -> dict[str, Fingerprint]:
+        """Fingerprints of the data of a seed by part, without initial states in domains that have none."""
+        source = self.loaded().source(root)
+        fingerprints = {}
         for part in parts:
             if part == STARTS:
-                source = domain.source(root)
                 starts = [source.starts(task.concept, self.samples, EVALUATION_SEED + seed) for task in self.test]
                 tensors = [tensor for states in starts if states is not None for tensor in states.observed.values()]
                 if tensors:
-                    known_by = bytes_hash(b"".join(tensor.contiguous().numpy().tobytes() for tensor in tensors))
-                    prints[part] = Print.of(tensors, known_by)
+                    known_hash = bytes_hash(b"".join(tensor.contiguous().numpy().tobytes() for tensor in tensors))
+                    fingerprints[part] = Fingerprint.of(tensors, known_hash)
             else:
                 drawn = self.drawn(part, seed, root)
-                prints[part] = Print.of([drawn.states], drawn.hash)
-        return prints
+                fingerprints[part] = Fingerprint.of([drawn.states], drawn.hash)
+        return fingerprints
 
     def drawn(self, part: str, seed: int, root: Path | None) -> Demonstrations:
-        """The demonstrations of a part.
-
-        Args:
-            part: ``training``, ``demonstrations`` of the test's concepts, or ``validation`` for the concepts to tune on.
-            seed: seed of the data.
-            root: folder of the user's copy of the data.
-        """
-        source = self.loaded().source(root)
+        """Demonstrations of a part: of the test's concepts (``demonstrations``), or of :attr:`validation` or :attr:`training`."""
+        domain = self.loaded()
+        source = domain.source(root)
         if part == TRAINING:
-            return self._training(source, seed)
-        concepts = self.validation if part == VALIDATION else self.learned
+            demonstrations = source.split("train", self.training.count, seed)
+            if self.training.recoveries and isinstance(source, Recoveries):
+                demonstrations = concatenate([demonstrations, source.recoveries("train", self.training.recoveries, seed)])
+            return demonstrations
+        concepts = self.validation if part == VALIDATION else domain.concepts.suites[self.test_suite].learned
         return concatenate([source.draw(concept, self.demonstrations, DEMONSTRATION_SEED + seed) for concept in concepts])
-
-    def _training(self, source: Source, seed: int) -> Demonstrations:
-        demonstrations = source.split("train", self.training.count, seed)
-        if self.training.recoveries and isinstance(source, Recoveries):
-            demonstrations = concatenate([demonstrations, source.recoveries("train", self.training.recoveries, seed)])
-        return demonstrations
-
-    @property
-    def learned(self) -> tuple[str, ...]:
-        """Distinct new concepts, in the order of the domain's suite."""
-        return load_domain(self.domain).concepts.suites[self.test_suite].learned
 
     def check_data(self, seed: int, root: Path | None, parts: Sequence[str]) -> bool:
         """Compare data with the frozen suite. Parts without a fingerprint are skipped.
@@ -193,14 +190,15 @@ class BenchmarkSuite:
             UserError: for other data, with suite, seed, part and both hashes.
         """
         known = self.data.get(str(seed), {})
-        prints = self.prints(seed, root, [part for part in parts if part in known])
-        for part, value in prints.items():
-            if value.hash != known[part].hash and not value.is_near(known[part]):
-                raise UserError(
-                    f"suite {self.name}, seed {seed}, {part}: expected data with the hash {known[part].hash}, found {value.hash}: "
-                    "the generator was changed; take the version of ftl-lightning that the suite was frozen in"
-                )
-        return all(value.hash == known[part].hash for part, value in prints.items())
+        drawn = self.fingerprints(seed, root, [part for part in parts if part in known])
+        for part, value in drawn.items():
+            require(
+                value.hash == known[part].hash or value.is_near(known[part]),
+                f"suite {self.name}, seed {seed}, {part}",
+                f"data with the hash {known[part].hash}",
+                f"{value.hash}: the generator was changed; take the version of ftl-lightning that the suite was frozen in",
+            )
+        return all(value.hash == known[part].hash for part, value in drawn.items())
 
 
 def suite_names() -> tuple[str, ...]:
@@ -214,13 +212,65 @@ def load_suite(name: str) -> BenchmarkSuite:
     Raises:
         UserError: for an unknown name or a damaged file.
     """
-    if name not in suite_names():
-        raise UserError(f"suites: expected some of {', '.join(suite_names())}, found {short(name)!r}")
+    names = suite_names()
+    require(name in names, "suites", f"some of {', '.join(names)}", short(name))
     path = FOLDER / f"{name}.json"
     with about(path):
         return from_mapping(BenchmarkSuite, read_json(path, "a suite"), "")
 
 
-def suites() -> Iterator[BenchmarkSuite]:
-    """All suites."""
-    return (load_suite(name) for name in suite_names())
+def write_data(suite: BenchmarkSuite, seeds: Sequence[int], folder: Path, form: str, root: Path | None) -> list[Path]:
+    """Write training pairs, and demonstrations for tuning and test, with ``README.md`` and ``hashes.json``.
+
+    Args:
+        suite: the suite.
+        seeds: seeds of the data.
+        folder: parent of the output folder, which has the suite's name.
+        form: format of :data:`FORMATS`. Minari's data sets go to Minari's folder, under ``benchmark/SUITE-PART-seedN-v0``.
+        root: folder of the user's copy of the data.
+
+    Returns:
+        Written files, without Minari's data sets.
+    """
+    require(form in FORMATS, "format", f"one of {', '.join(FORMATS)}", form)
+    place, known = folder / suite.name, {}
+    for seed in seeds:
+        suite.check_data(seed, root, EXPORTED)
+        for part in EXPORTED:
+            drawn, name = suite.drawn(part, seed, root), f"{part}-seed{seed}"
+            path = place / f"{name}.{form}"
+            other = {"lerobot": f"lerobot:{place / name}", "minari": f"minari:benchmark/{suite.name}-{name}-v0"}
+            drawn.save(other.get(form, str(path)))
+            known[name] = {"content": drawn.hash, "demonstrations": str(len(drawn))}
+            known[name] |= {"file": file_hash(path)} if path.is_file() else {}
+    write_text(place / "hashes.json", json.dumps(known, indent=1) + "\n")
+    write_text(place / "README.md", _card(suite, suite.drawn(DEMONSTRATIONS, seeds[0], root), seeds, form))
+    return sorted(path for path in place.rglob("*") if path.is_file())
+
+
+def _card(suite: BenchmarkSuite, example: Demonstrations, seeds: Sequence[int], form: str) -> str:
+    """Description of exported data in Markdown."""
+    columns = ", ".join(f"{name} ({unit})" for name, unit in zip(example.state_names[:8], example.state_units[:8], strict=True))
+    more = f" and {len(example.state_names) - 8} more" if len(example.state_names) > 8 else ""
+    new = tuple(dict.fromkeys(example.concepts))
+    observed = ", ".join(example.observed) or "nothing: behaviour starts nowhere"
+    licence = "that of your own copy of the recordings; do not pass them on." if suite.recordings else "MIT, as the software's."
+    return f"""# {suite.title}
+
+Data of the suite `{suite.name}` (hash {suite.hash}) of the benchmark *few-shot concepts*, generated by
+ftl-lightning {__version__} from the seeds {", ".join(map(str, seeds))}.
+Format: {form}. `hashes.json` has the hash of each part.
+
+- `training-seedN`: {suite.training.count} demonstrations of each of {len(suite.training.concepts)} concepts, to pretrain on
+- `validation-seedN`: {suite.demonstrations} of each of {len(suite.validation)} other concepts, to tune on
+- `demonstrations-seedN`: {suite.demonstrations} of each of {len(new)} new concepts, from which they are learned; not to tune on
+
+- States: {columns}{more}; up to {example.states.shape[1]} steps.
+- Observed: {observed}.
+- Training concepts: {", ".join(suite.training.concepts)}.
+- Concepts to tune on: {", ".join(suite.validation)}.
+- New concepts: {", ".join(new)}.
+- Measures: {", ".join(suite.measures)}; {suite.samples} samples of each concept.
+
+Licence: {licence}
+"""

@@ -4,26 +4,23 @@ import asyncio
 import json
 import secrets
 import threading
-from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
-from contextlib import asynccontextmanager
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from typing import Any
 from urllib.parse import quote
 
-from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
-from starlette.requests import ClientDisconnect, Request
+from starlette.requests import Request
 from starlette.responses import HTMLResponse, JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
 
 from ftl_lightning.apps.play import requests
-from ftl_lightning.apps.play.guard import Guard, body_of
 from ftl_lightning.apps.play.page import POLICY, page
-from ftl_lightning.apps.play.workspace import Stopped, Workspace
-from ftl_lightning.services.errors import UserError, mistake_of_machine, short
-from ftl_lightning.services.printing import line, say
+from ftl_lightning.apps.play.server import body_of, message_of
+from ftl_lightning.apps.play.workspace import Stopped, Workspace, title_of
+from ftl_lightning.services.errors import require, short
 from ftl_lightning.services.schema import from_mapping, parse_json
 
-MOST_ASKED, MOST_OPENED = 4 * 2**20, 64 * 2**20
+MOST_BODY, MOST_FILE = 4 * 2**20, 64 * 2**20
 """Maximum bytes of a request, and of an uploaded file."""
 MOST_WAITING = 32
 """Maximum number of pending requests; further requests are refused."""
@@ -32,7 +29,8 @@ WAIT = 0.5
 SERVED = "; connect-src 'self'; frame-ancestors 'none'"
 """Addition to the policy of every page: a served page may send requests to this server."""
 
-ANSWERS: Mapping[str, tuple[type, Callable[[Workspace, Any], Any]]] = {
+Handler = tuple[type, Callable[[Workspace, Any], Any]]
+ANSWERS: Mapping[str, Handler] = {
     "scene": (requests.Pose, Workspace.scene),
     "record": (requests.Recorded, Workspace.record),
     "draw": (requests.Drawn, Workspace.draw),
@@ -41,21 +39,12 @@ ANSWERS: Mapping[str, tuple[type, Callable[[Workspace, Any], Any]]] = {
     "clear": (requests.Nothing, Workspace.clear),
     "sample": (requests.Sample, Workspace.sample),
 }
-"""Type and handler of requests with a JSON body."""
-
-MISTAKES = (
-    UserError,
-    ArithmeticError,
-    AssertionError,
-    AttributeError,
-    LookupError,
-    MemoryError,
-    OSError,
-    RuntimeError,
-    TypeError,
-    ValueError,
-)
-"""Exceptions that are reported in one line; the server continues."""
+"""Type of the JSON body and handler of requests that are answered by the handler's result."""
+CHANGES: Mapping[str, Handler] = {
+    "forget": (requests.Named, Workspace.forget),
+    "rename": (requests.Renamed, Workspace.rename),
+}
+"""The same of requests that are answered by the whole state of the page."""
 
 
 class Desk:
@@ -69,7 +58,7 @@ class Desk:
     def __init__(self, models: Sequence[str], make: Callable[[str], Workspace]) -> None:
         self._models, self._make = tuple(models), make
         self._opened: dict[str, Workspace] = {}
-        self._now = self._models[0]
+        self._current = self._models[0]
         self._lock, self._waiting = asyncio.Lock(), 0
         self.ended = threading.Event()
 
@@ -84,7 +73,7 @@ class Desk:
         self._waiting += 1
         try:
             async with self._lock:
-                return await asyncio.to_thread(lambda: do(self._workspace(self._now)))
+                return await asyncio.to_thread(lambda: do(self._workspace(self._current)))
         finally:
             self._waiting -= 1
 
@@ -99,57 +88,14 @@ class Desk:
         Raises:
             UserError: for a model that cannot be opened.
         """
-        if model not in self._models:
-            raise UserError(f"model: expected one of {', '.join(self._models)}, found {short(model)!r}")
+        require(model in self._models, "model", f"one of {', '.join(self._models)}", short(model))
         workspace = self._workspace(model)
-        self._now = model
+        self._current = model
         return self.state(workspace)
 
     def state(self, workspace: Workspace) -> dict[str, Any]:
         """Initial state of the page."""
-        return workspace.state() | {"models": [{"name": name, "title": _title(name)} for name in self._models]}
-
-
-def _title(model: str) -> str:
-    return model.rpartition("/")[2].replace("_", " ")
-
-
-Begin = Callable[[], Awaitable[Any]]
-
-
-def guarded(
-    routes: Sequence[Route],
-    token: str,
-    hosts: Sequence[str],
-    end: Callable[[], None],
-    begin: Begin | None = None,
-) -> Starlette:
-    """Application that answers requests of a single page.
-
-    Args:
-        routes: routes besides the end of the program.
-        token: required in requests.
-        hosts: ``host:port`` that requests may name.
-        end: ends the program.
-        begin: run at the start, while requests are already answered; ``None`` for nothing.
-    """
-
-    async def ended(request: Request) -> Response:
-        asyncio.get_running_loop().call_later(WAIT / 2, end)
-        return JSONResponse({"ended": True})
-
-    @asynccontextmanager
-    async def lifespan(app: Starlette) -> AsyncIterator[None]:
-        beginning = asyncio.ensure_future(begin()) if begin is not None else None
-        yield
-        if beginning is not None:
-            beginning.cancel()
-
-    every = [*routes, Route("/api/end", ended, methods=["POST"])]
-    handlers: Any = {HTTPException: _refused, **dict.fromkeys(MISTAKES, _mistaken)}
-    application = Starlette(routes=every, exception_handlers=handlers, lifespan=lifespan)
-    application.add_middleware(Guard, token=token, hosts=frozenset(hosts))
-    return application
+        return workspace.state() | {"models": [{"name": name, "title": title_of(name)} for name in self._models]}
 
 
 async def first_page(request: Request) -> Response:
@@ -187,28 +133,30 @@ def playing(desk: Desk) -> list[Route]:
         return JSONResponse(await desk.work(lambda _: desk.open(body.model)))
 
     async def thumbnail(request: Request) -> Response:
-        return JSONResponse(await desk.work(lambda workspace: workspace.thumbnail(_id(request))))
+        key = request.query_params.get("id", "")
+        return JSONResponse(await desk.work(lambda workspace: workspace.thumbnail(key)))
 
-    async def concept(request: Request) -> Response:
-        return _attached(*await desk.work(lambda workspace: workspace.concept_file(_id(request))))
+    def downloading(name: str, do: Callable[[Workspace, str], tuple[str, bytes]]) -> Route:
+        async def download(request: Request) -> Response:
+            key = request.query_params.get("id", "")
+            file, content = await desk.work(lambda workspace: do(workspace, key))
+            headers = {"content-disposition": f"attachment; filename*=UTF-8''{quote(file, safe='')}"}
+            return Response(content, media_type="application/octet-stream", headers=headers)
 
-    async def demonstrations(request: Request) -> Response:
-        return _attached(*await desk.work(lambda workspace: workspace.demonstrations_file(_id(request))))
+        return Route(f"/api/{name}", download)
 
     async def upload(request: Request) -> Response:
-        name, content = request.query_params.get("name", ""), await body_of(request, MOST_OPENED)
+        name, content = request.query_params.get("name", ""), await body_of(request, MOST_FILE)
         await desk.work(lambda workspace: workspace.upload(name, content))
         return JSONResponse(await desk.work(desk.state))
 
-    async def forget(request: Request) -> Response:
-        body = from_mapping(requests.Named, await _body(request), "")
-        await desk.work(lambda workspace: workspace.forget(body))
-        return JSONResponse(await desk.work(desk.state))
+    def answering(name: str, kind: type, do: Callable[[Workspace, Any], Any]) -> Route:
+        async def answer(request: Request) -> Response:
+            body = from_mapping(kind, await _body(request), "")
+            result = await desk.work(lambda workspace: do(workspace, body))
+            return JSONResponse(await desk.work(desk.state) if name in CHANGES else result)
 
-    async def rename(request: Request) -> Response:
-        body = from_mapping(requests.Renamed, await _body(request), "")
-        await desk.work(lambda workspace: workspace.rename(body))
-        return JSONResponse(await desk.work(desk.state))
+        return Route(f"/api/{name}", answer, methods=["POST"])
 
     async def learn(request: Request) -> Response:
         body = from_mapping(requests.Learn, await _body(request), "")
@@ -218,38 +166,17 @@ def playing(desk: Desk) -> list[Route]:
         Route("/", first_page),
         Route("/api/state", state),
         Route("/api/thumbnail", thumbnail),
-        Route("/api/concept", concept),
-        Route("/api/demonstrations", demonstrations),
-        *(Route(f"/api/{name}", _answering(desk, name), methods=["POST"]) for name in ANSWERS),
+        downloading("concept", Workspace.concept_file),
+        downloading("demonstrations", Workspace.demonstrations_file),
+        *(answering(name, *handler) for name, handler in {**ANSWERS, **CHANGES}.items()),
         Route("/api/open", opened, methods=["POST"]),
         Route("/api/upload", upload, methods=["POST"]),
-        Route("/api/forget", forget, methods=["POST"]),
-        Route("/api/rename", rename, methods=["POST"]),
         Route("/api/learn", learn, methods=["POST"]),
     ]
 
 
-def _answering(desk: Desk, name: str) -> Callable[[Request], Any]:
-    kind, do = ANSWERS[name]
-
-    async def answer(request: Request) -> Response:
-        body = from_mapping(kind, await _body(request), "")
-        return JSONResponse(await desk.work(lambda workspace: do(workspace, body)))
-
-    return answer
-
-
-def _id(request: Request) -> str:
-    return request.query_params.get("id", "")
-
-
 async def _body(request: Request) -> Any:
-    return parse_json(await body_of(request, MOST_ASKED), "a question in JSON")
-
-
-def _attached(name: str, content: bytes) -> Response:
-    disposition = f"attachment; filename*=UTF-8''{quote(name, safe='')}"
-    return Response(content, media_type="application/octet-stream", headers={"content-disposition": disposition})
+    return parse_json(await body_of(request, MOST_BODY), "a question in JSON")
 
 
 async def _learned(desk: Desk, request: Request, body: requests.Learn) -> AsyncIterator[str]:
@@ -268,7 +195,7 @@ async def _learned(desk: Desk, request: Request, body: requests.Learn) -> AsyncI
         except HTTPException as error:
             tell({"error": error.detail})
         except Exception as error:
-            tell({"error": _one_line(error)})
+            tell({"error": message_of(error)})
         finally:
             tell(None)
 
@@ -289,23 +216,3 @@ async def _learned(desk: Desk, request: Request, body: requests.Learn) -> AsyncI
     finally:
         stopped.set()
         await asyncio.shield(working)
-
-
-def _one_line(error: Exception) -> str:
-    """Message of an error for the user; failures of the program are printed as well."""
-    if isinstance(error, UserError):
-        return line(str(error))
-    if (message := mistake_of_machine(error)) is not None:
-        return line(message)
-    say(f"error: {type(error).__name__}: {error}", error=True)
-    return f"the program failed ({type(error).__name__}); what it printed says more"
-
-
-async def _refused(request: Request, error: Exception) -> Response:
-    status, detail = (error.status_code, error.detail) if isinstance(error, HTTPException) else (400, "broken off")
-    return JSONResponse({"error": line(str(detail))}, status)
-
-
-async def _mistaken(request: Request, error: Exception) -> Response:
-    expected = isinstance(error, UserError | ClientDisconnect) or mistake_of_machine(error) is not None
-    return JSONResponse({"error": _one_line(error)}, 400 if expected else 500)

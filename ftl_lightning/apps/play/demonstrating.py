@@ -1,4 +1,4 @@
-"""Demonstrations of one concept collected on the page: by hand, from the library or from files."""
+"""Demonstrations of a concept collected on the page: by hand, from the library or from files."""
 
 import tempfile
 from dataclasses import replace
@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import Any
 
 from ftl_lightning.apps.play import requests
-from ftl_lightning.apps.play.films import Json, film, films
+from ftl_lightning.apps.play.mixing import Json, film, films
 from ftl_lightning.data.check import check
 from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.domains.domain import Source
 from ftl_lightning.domains.recorder import Recorder, Scene, check_path
 from ftl_lightning.few_shot.learner import FewShot
-from ftl_lightning.services.errors import UserError, short
+from ftl_lightning.services.errors import UserError, require, short
 from ftl_lightning.training.checks import fit_findings
 
 WANTED = 5
@@ -24,7 +24,7 @@ FILES = (".npz", ".safetensors")
 
 
 class Demonstrating:
-    """Demonstrations of one concept, and the scenes in which more can be recorded.
+    """Demonstrations of a concept, and the scenes in which more can be recorded.
 
     Args:
         model: model of the same domain.
@@ -36,8 +36,8 @@ class Demonstrating:
 
     def __init__(self, model: FewShot, source: Source) -> None:
         self._model, self._domain, self._source = model, model.domain, source
-        self._entries: list[tuple[int, Demonstrations]] = []
-        self._before: list[list[tuple[int, Demonstrations]]] = []
+        self._entries: dict[int, Demonstrations] = {}
+        self._before: list[dict[int, Demonstrations]] = []
         self._scenes: dict[int, Scene] = {}
         self._count = 0
         self._library: Json | None = None
@@ -46,7 +46,7 @@ class Demonstrating:
     @property
     def name(self) -> str:
         """Name of the first demonstration that came with a name; else empty."""
-        return next((entry.concepts[0] for _, entry in self._entries if entry.concepts[0]), "")
+        return next((entry.concepts[0] for entry in self._entries.values() if entry.concepts[0]), "")
 
     @property
     def library(self) -> Json:
@@ -66,32 +66,27 @@ class Demonstrating:
         """Suffixes of readable files."""
         return (*FILES, *self._domain.recordings.imports)
 
-    def told(self) -> dict[str, Any]:
+    def report(self) -> dict[str, Any]:
         """Films, findings of the check for each demonstration and for all, and whether a change can be undone."""
         flags: dict[int, list[str]] = {}
         general: list[str] = []
         if self._entries:
             joined = self.together("demonstrations")
-            findings = (*check(joined), *fit_findings(self._model.model, joined))  # the latter runs the model, which takes longer
+            findings = (*check(joined), *fit_findings(self._model.model, joined))
             for finding in (item for item in findings if item.severity != "note"):
                 for row in finding.rows:
                     flags.setdefault(row, []).append(finding.text)
                 general += [] if finding.rows else [finding.text]
         shown = [
             {"id": number, "film": films(self._domain, entry)[0], "flags": flags.get(row, [])}
-            for row, (number, entry) in enumerate(self._entries)
+            for row, (number, entry) in enumerate(self._entries.items())
         ]
         return {"demonstrations": shown, "check": general, "undo": bool(self._before), "wanted": WANTED}
 
     def together(self, name: str) -> Demonstrations:
-        """All demonstrations as those of one concept.
-
-        Raises:
-            UserError: if there are none.
-        """
-        if not self._entries:
-            raise UserError("demonstrations: expected one or more, found none; show the model something first")
-        joined = concatenate([entry for _, entry in self._entries])
+        """All demonstrations as those of a concept; at least one is required."""
+        require(self._entries, "demonstrations", "one or more", "none; show the model something first")
+        joined = concatenate(list(self._entries.values()))
         return replace(joined, concepts=(name,) * len(joined))
 
     def _recorder(self) -> Recorder:
@@ -99,56 +94,48 @@ class Demonstrating:
             raise UserError(f"scene: expected a model whose behaviour is shown by hand, found one of {self._domain.name}")
         return recorder
 
-    def scene(self, asked: requests.Pose) -> Json:
+    def scene(self, request: requests.Pose) -> Json:
         """Draw a new scene for a demonstration.
 
         Raises:
             UserError: in a domain without recording by hand, or for a task without scenes.
         """
         recorder = self._recorder()
-        if asked.task and asked.task not in recorder.tasks:
-            raise UserError(f"task: expected one of {len(recorder.tasks)} whose scenes can be drawn, found {short(asked.task)!r}")
+        expected = f"one of {len(recorder.tasks)} whose scenes can be drawn"
+        require(not request.task or request.task in recorder.tasks, "task", expected, short(request.task))
         self._count += 1
-        scene = recorder.scene(asked.task, self._count)
-        self.task = asked.task or self.task
+        scene = recorder.scene(request.task, self._count)
+        self.task = request.task or self.task
         self._scenes[self._count] = scene
         self._scenes = dict(list(self._scenes.items())[-MOST_SCENES:])
         pieces = [{"name": piece.name, "at": list(piece.at), "shapes": list(piece.shapes)} for piece in scene.pieces]
         content = {"film": film(scene.film), "pieces": pieces, "speed": scene.speed, "seconds": scene.seconds}
         return {"scene": self._count, **content}
 
-    def record(self, asked: requests.Recorded) -> None:
+    def record(self, request: requests.Recorded) -> None:
         """Add a demonstration recorded by hand.
 
         Raises:
             UserError: for an unknown scene, or a path that shows nothing.
         """
         recorder = self._recorder()
-        if (scene := self._scenes.get(asked.scene)) is None:
-            raise UserError(f"scene: expected one that was asked for, found {asked.scene}; reload the page")
-        self.add(recorder.record(scene, *check_path(scene, asked.path, asked.seconds)))
+        require(request.scene in self._scenes, "scene", "a scene drawn before", f"{request.scene}; reload the page")
+        scene = self._scenes[request.scene]
+        self.add(recorder.record(scene, *check_path(scene, request.path, request.seconds)))
 
-    def draw(self, asked: requests.Drawn) -> None:
+    def draw(self, request: requests.Drawn) -> None:
         """Add demonstrations of the library: an expert's, or recordings.
 
         Raises:
             UserError: for a task without demonstrations.
         """
-        self._domain.check_goal(asked.task, "task")
+        self._domain.check_goal(request.task, "task")
         self._count += 1
-        self.add(self._source.draw(asked.task, asked.count, self._count))
-        self.task = asked.task
+        self.add(self._source.draw(request.task, request.count, self._count))
+        self.task = request.task
 
     def read(self, name: str, content: bytes) -> None:
-        """Add the demonstrations of a file.
-
-        Args:
-            name: file name, whose suffix determines the program.
-            content: bytes of the file.
-
-        Raises:
-            UserError: for an unknown program, another domain, or a damaged file.
-        """
+        """Add the demonstrations of a file, whose suffix determines the program; damaged files and other domains are refused."""
         ending, stem = Path(name).suffix.lower(), Path(name).stem
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / f"file{ending}"
@@ -156,37 +143,25 @@ class Demonstrating:
             try:
                 imports = self._domain.recordings.imports.get(ending)
                 self.add(self._model.demonstrations((imports or Demonstrations.load)(path), name=stem))
-            except UserError as error:  # names a file that the user does not know
-                message = str(error).replace(str(path), short(Path(name).name))
-                message = message if message.startswith(short(Path(name).name)) else f"{short(Path(name).name)}: {message}"
-                raise UserError(message) from error
+            except UserError as error:  # names the temporary file
+                file = short(Path(name).name)
+                raise UserError(f"{file}: {str(error).replace(str(path), file).removeprefix(f'{file}: ')}") from error
 
     def add(self, more: Demonstrations) -> None:
-        """Append demonstrations as separate entries.
+        """Append demonstrations as separate entries, at most :data:`MOST` in all."""
+        count = len(self._entries) + len(more)
+        require(count <= MOST, "demonstrations", f"at most {MOST} of a concept", count)
+        self._change(self._entries | {self._count + row + 1: more.rows([row]) for row in range(len(more))})
+        self._count += len(more)
 
-        Raises:
-            UserError: if there are too many.
-        """
-        if len(self._entries) + len(more) > MOST:
-            raise UserError(f"demonstrations: expected at most {MOST} of a concept, found {len(self._entries) + len(more)}")
-        self._keep()
-        for row in range(len(more)):
-            self._count += 1
-            self._entries.append((self._count, more.rows([row])))
+    def _change(self, entries: dict[int, Demonstrations]) -> None:
+        self._before = [*self._before, self._entries][-MOST_UNDONE:]
+        self._entries = entries
 
-    def _keep(self) -> None:
-        self._before = [*self._before, list(self._entries)][-MOST_UNDONE:]
-
-    def remove(self, asked: requests.One) -> None:
-        """Remove a demonstration.
-
-        Raises:
-            UserError: if it does not exist.
-        """
-        if all(number != asked.id for number, _ in self._entries):
-            raise UserError(f"id: expected a demonstration that is there, found {asked.id}")
-        self._keep()
-        self._entries = [(number, entry) for number, entry in self._entries if number != asked.id]
+    def remove(self, request: requests.One) -> None:
+        """Remove an existing demonstration."""
+        require(request.id in self._entries, "id", "an existing demonstration", request.id)
+        self._change({number: entry for number, entry in self._entries.items() if number != request.id})
 
     def undo(self) -> None:
         """Undo the last change."""
@@ -196,13 +171,12 @@ class Demonstrating:
     def clear(self) -> None:
         """Remove all demonstrations."""
         if self._entries:
-            self._keep()
-        self._entries = []
+            self._change({})
 
 
-def as_npz(own: Demonstrations) -> bytes:
+def as_npz(demonstrations: Demonstrations) -> bytes:
     """Demonstrations as an ``.npz`` file."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "demonstrations.npz"
-        own.save(path)
+        demonstrations.save(path)
         return path.read_bytes()

@@ -1,4 +1,4 @@
-"""Films of samples of mixed concepts, judged where the domain can judge."""
+"""Films as JSON for the page: of demonstrations, and of samples of mixed concepts, judged where the domain can judge."""
 
 import functools
 import operator
@@ -7,18 +7,23 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+from torch import Tensor
 
-from ftl_lightning.apps.play.films import Json, episode_films, films
 from ftl_lightning.apps.play.requests import Sample
 from ftl_lightning.apps.play.same import Sampled
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import InitialStates
-from ftl_lightning.domains.domain import Domain
+from ftl_lightning.domains.domain import SUCCESS, Domain
+from ftl_lightning.domains.execution import Rollout
+from ftl_lightning.domains.films import VectorFilm
+from ftl_lightning.domains.pictures import Show, line_film
+from ftl_lightning.evaluation.films import packed, packed_space
 from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.services.errors import UserError, short
 from ftl_lightning.training.judging import judging_domain
 
+Json = dict[str, Any]
 STEPS = 10
 """Maximum number of sampling steps, so that a moving slider is answered at once."""
 JOINED = " and "
@@ -63,7 +68,7 @@ def starts_of(model: FewShot, tasks: Sequence[str], count: int, seed: int) -> tu
     for task in (*filter(None, tasks), *model.training_concepts):
         if model.domain.concepts.reads(task):
             return task, model.starts(task, count, seed)
-    raise UserError(f"task: expected one that {model.domain.name} reads, found {short(', '.join(tasks))!r}")
+    raise UserError(f"task: expected a goal of {model.domain.name}, found {short(', '.join(tasks))!r}")
 
 
 def goal_of(domain: Domain, names: Sequence[str], task: str) -> str:
@@ -126,8 +131,54 @@ def samples(model: FewShot, mixture: Mixture, asked: Sample, tasks: Sequence[str
         raise UserError(f"execute: expected a model whose behaviour is executed, found one of {model.domain.name}")
     else:
         done = model.execute(mixture.mixed, starts, goal, seed=asked.seed, **how)
-        outcomes: Mapping[str, torch.Tensor] = model.domain.judge(goal, done.rollout) if goal else {}
+        outcomes: Mapping[str, Tensor] = model.domain.judge(goal, done.rollout) if goal else {}
         shown = episode_films(model.domain, done.rollout, outcomes)
         verdict = ", ".join(f"{name} {value:.2f}" for name, value in done.outcomes.items())
         verdict = f"mean of {asked.count}: {verdict} ({goal})" if verdict else ""
     return shown, verdict, Sampled(count=asked.count, seed=asked.seed, task=task, execute=asked.execute, **how)
+
+
+def film(drawn: VectorFilm, right: bool | None = None, outcome: str = "") -> Json:
+    """Film of shapes; ``right`` is ``None`` if not judged."""
+    window = [round(edge, 4) for edge in drawn.window]
+    shown = {"frames": drawn.frames, "rate": round(drawn.rate, 3), "window": window, "shapes": packed(drawn)}
+    return {**shown, "right": right, "told": outcome}
+
+
+def plan_film(show: Show, states: Tensor, starts: InitialStates | None, right: bool | None = None) -> Json:
+    """Film of a plan or demonstration ``(time, state)``, with a single initial state in domains that have any."""
+    if show.wireframe is not None:
+        body = show.wireframe(states)
+        return {"space": packed_space(body), "frames": len(body.points), "rate": body.rate, "right": right, "told": ""}
+    return film((show.vector_film or line_film)(states, starts), right)
+
+
+def films(domain: Domain, plans: Demonstrations, right: Sequence[bool] | None = None) -> list[Json]:
+    """Films of all demonstrations or samples with finite states."""
+    starts, observed = plans.initial_states, bool(domain.observed)
+    return [
+        plan_film(
+            domain.show,
+            plans.states[row, :length],
+            starts.take([row]) if observed else None,
+            None if right is None else bool(right[row]),
+        )
+        for row, length in enumerate(plans.lengths.tolist())
+        if plans.states[row].isfinite().all()
+    ]
+
+
+def episode_films(domain: Domain, rollout: Rollout, outcomes: Mapping[str, Tensor]) -> list[Json]:
+    """Films of executed episodes with their outcomes ``(episode,)`` by name; empty in domains that do not draw them."""
+    draw = None if domain.closed_loop is None else domain.closed_loop.vector_film
+    if draw is None:
+        return []
+    succeeded = outcomes.get(SUCCESS)
+    booleans = {name: values for name, values in outcomes.items() if values.dtype == torch.bool}
+    shown = []
+    for episode in range(len(rollout.failed)):
+        words = ", ".join(name for name, values in booleans.items() if values[episode])
+        words = words or (f"no {SUCCESS}" if SUCCESS in booleans else "")
+        right = None if succeeded is None else bool(succeeded[episode])
+        shown.append(film(draw(rollout.take(episode, episode + 1)), right, words))
+    return shown

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.errors import require
 from ftl_lightning.services.ranges import check_count, check_factor, check_range
 
 MOST_SAMPLES, MOST_DRAWN, MOST_PARTS, MOST_NAME = 64, 20, 12, 100
@@ -17,8 +17,7 @@ def check_name(name: str) -> None:
     Raises:
         UserError: for an empty or too long name, or letters that cannot be printed.
     """
-    if not 1 <= len(name.strip()) <= MOST_NAME or not name.isprintable():
-        raise UserError(f"name: expected 1 to {MOST_NAME} letters, found {len(name)}")
+    require(1 <= len(name.strip()) <= MOST_NAME and name.isprintable(), "name", f"1 to {MOST_NAME} letters", len(name))
 
 
 @dataclass(frozen=True)
@@ -143,5 +142,5 @@ class Sample:
         check_count("parts", len(self.parts), 1, MOST_PARTS)
         check_count("count", self.count, 1, MOST_SAMPLES)
         check_range("seed", self.seed, 0)
-        if self.temperature is not None and not 0 <= self.temperature <= MOST_TEMPERATURE:
-            raise UserError(f"temperature: expected 0 to {MOST_TEMPERATURE:g}, found {self.temperature}")
+        if self.temperature is not None:
+            check_range("temperature", self.temperature, 0, MOST_TEMPERATURE)

@@ -88,13 +88,7 @@ class Sampled:
 
 
 def python(model: str, parts: Sequence[Part], how: Sampled | None) -> str:
-    """Python script.
-
-    Args:
-        model: name or folder.
-        parts: terms of the mixture, or the learned concept.
-        how: settings of sampling; ``None`` for no samples.
-    """
+    """Python script that learns the concepts of ``parts`` and, unless ``how`` is ``None``, samples their mixture."""
     learned = list({part.learned.variable: part.learned for part in parts if part.learned}.values())
     lines = ["from ftl_lightning import FewShot"]
     lines += ["from ftl_lightning.data import Demonstrations"] if learned else []
@@ -144,13 +138,7 @@ def composed(parts: Sequence[Part]) -> str:
 
 
 def command(model: str, configuration: str, parts: Sequence[Part], how: Sampled | None) -> str:
-    """Shell commands.
-
-    Args:
-        model: name or folder.
-        configuration: file of ``invert`` for the model.
-        parts, how: as in :func:`python`.
-    """
+    """Shell commands that do the same as :func:`python`; ``configuration`` is the file of ``invert`` for the model."""
     lines = []
     for entry in {part.learned.variable: part.learned for part in parts if part.learned}.values():
         words = ["python", "-m", "ftl_lightning", "invert", "--config", configuration, "--model.pretrained", model]

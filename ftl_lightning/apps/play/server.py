@@ -1,26 +1,176 @@
-"""Serve the page on this machine until the user ends the program."""
+"""Serve a page on this machine until the user ends the program: access control, errors and the server."""
 
+import asyncio
 import contextlib
+import hmac
 import ipaddress
 import secrets
 import socket
 import webbrowser
-from collections.abc import Callable, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import FrameType
+from typing import Any
 
 import uvicorn
+from starlette.applications import Starlette
+from starlette.datastructures import MutableHeaders
+from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from ftl_lightning.apps.play.application import Begin, guarded
-from ftl_lightning.services.errors import UserError, short
-from ftl_lightning.services.printing import say
+from ftl_lightning.services.errors import UserError, mistake_of_machine, short
+from ftl_lightning.services.printing import line, say
 
 LOOPBACK = "127.0.0.1"
 PORT = 8765
 """Default port, unless another program uses it."""
 MOST_CONNECTIONS, IDLE, PATIENCE = 200, 5, 3
 """Maximum number of connections, seconds before an idle connection is closed, and seconds for the last answers at the end."""
+TOKEN = "x-token"
+"""Header required in every request but the first."""
+RECEIVE_SECONDS, END_SECONDS = 30.0, 0.25
+"""Maximum seconds to receive a request, and seconds from the request to end the program to its end."""
+HEADERS: Mapping[str, str] = {
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "no-referrer",
+    "cache-control": "no-store",
+    "cross-origin-opener-policy": "same-origin",
+    "cross-origin-resource-policy": "same-origin",
+    "x-frame-options": "DENY",
+}
+"""Headers of every answer."""
+MISTAKES = (
+    UserError,
+    ArithmeticError,
+    AssertionError,
+    AttributeError,
+    ClientDisconnect,
+    LookupError,
+    MemoryError,
+    OSError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+)
+"""Exceptions that are reported in one line. Starlette handles the class Exception outside of the guard, which adds headers."""
+Begin = Callable[[], Awaitable[Any]]
+"""Called at the start, while requests are already answered."""
+
+
+class Guard:
+    """Refuse requests that are not from the page: with other host names (which a name server may point here), from pages of other
+    origins, or without the token of this run.
+    """
+
+    def __init__(self, app: ASGIApp, token: str, hosts: frozenset[str]) -> None:
+        self._app, self._token, self._hosts = app, token, hosts
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] == "lifespan":
+            await self._app(scope, receive, send)
+            return
+        if scope["type"] != "http":
+            await send({"type": "websocket.close", "code": 1008})
+            return
+
+        async def with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                MutableHeaders(scope=message).update(HEADERS)
+            await send(message)
+
+        refusal = self._refusal(Request(scope))
+        answer = self._app if refusal is None else JSONResponse({"error": refusal}, 403, {"connection": "close"})
+        await answer(scope, receive, with_headers)
+
+    def _refusal(self, request: Request) -> str | None:
+        """Reason for refusing a request; ``None`` if it is accepted."""
+        host = request.headers.getlist("host")
+        if len(host) != 1 or host[0].lower() not in self._hosts:
+            return f"host: expected {min(self._hosts)}, found {short(', '.join(host)) or 'none'}"
+        for origin in request.headers.getlist("origin"):
+            if origin.lower().removeprefix("http://") not in self._hosts:
+                return f"origin: expected http://{min(self._hosts)}, found {short(origin)}"
+        first = request.scope["path"] == "/"
+        given = request.query_params.getlist("token") if first else request.headers.getlist(TOKEN)
+        if len(given) != 1 or not hmac.compare_digest(given[0].encode(), self._token.encode()):
+            return "token: expected that of the address which the program printed, found another; open that address"
+        return None
+
+
+async def body_of(request: Request, most: int) -> bytes:
+    """Read the bytes of a request.
+
+    Raises:
+        HTTPException: for more than ``most`` bytes, or if they take too long.
+    """
+    message = f"expected at most {most // 2**20} MB, found more"
+    length = request.headers.get("content-length", "0")
+    if not length.isdecimal() or int(length) > most:
+        raise HTTPException(413, message)
+    content = bytearray()
+    try:
+        async with asyncio.timeout(RECEIVE_SECONDS):
+            async for part in request.stream():
+                content += part
+                if len(content) > most:
+                    raise HTTPException(413, message)
+    except TimeoutError as error:
+        raise HTTPException(408, f"expected a whole question within {RECEIVE_SECONDS:.0f} seconds, found a part") from error
+    return bytes(content)
+
+
+def guarded(
+    routes: Sequence[Route], token: str, hosts: Sequence[str], end: Callable[[], None], begin: Begin | None = None
+) -> Starlette:
+    """Application that answers requests of a single page.
+
+    Args:
+        routes: routes besides the end of the program.
+        token: required in requests.
+        hosts: ``host:port`` that requests may name.
+        end: ends the program.
+        begin: called at the start; ``None`` for nothing.
+    """
+
+    async def ended(request: Request) -> Response:
+        asyncio.get_running_loop().call_later(END_SECONDS, end)
+        return JSONResponse({"ended": True})
+
+    @contextlib.asynccontextmanager
+    async def lifespan(app: Starlette) -> AsyncIterator[None]:
+        beginning = asyncio.ensure_future(begin()) if begin is not None else None
+        yield
+        if beginning is not None:
+            beginning.cancel()
+
+    handlers: Any = {HTTPException: _refused, **dict.fromkeys(MISTAKES, _mistaken)}
+    all_routes = [*routes, Route("/api/end", ended, methods=["POST"])]
+    application = Starlette(routes=all_routes, exception_handlers=handlers, lifespan=lifespan)
+    application.add_middleware(Guard, token=token, hosts=frozenset(hosts))
+    return application
+
+
+def message_of(error: Exception) -> str:
+    """Message of an error for the user; failures of the program are printed as well."""
+    if isinstance(error, UserError):
+        return line(str(error))
+    if (message := mistake_of_machine(error)) is not None:
+        return line(message)
+    say(f"error: {type(error).__name__}: {error}", error=True)
+    return f"the program failed ({type(error).__name__}); what it printed says more"
+
+
+async def _refused(request: Request, error: Exception) -> Response:
+    status, detail = (error.status_code, error.detail) if isinstance(error, HTTPException) else (400, "broken off")
+    return JSONResponse({"error": line(str(detail))}, status)
+
+
+async def _mistaken(request: Request, error: Exception) -> Response:
+    expected = isinstance(error, UserError | ClientDisconnect) or mistake_of_machine(error) is not None
+    return JSONResponse({"error": message_of(error)}, 400 if expected else 500)
 
 
 @dataclass(frozen=True)
@@ -44,13 +194,7 @@ def serve(
     begin: Begin | None = None,
     close: Callable[[], None] = lambda: None,
 ) -> None:
-    """Serve a page until Ctrl-C, or until the page ends the program.
-
-    Args:
-        routes: routes of the page.
-        place: address of the page.
-        begin: run at the start, while requests are already answered.
-        close: called when the program ends.
+    """Serve a page until Ctrl-C, or until the page ends the program; ``close`` is called at the end.
 
     Raises:
         UserError: if the address is not available.
@@ -110,19 +254,12 @@ def _listening(host: str, port: int) -> socket.socket:
         family = socket.AF_INET6 if ipaddress.ip_address(host).version == 6 else socket.AF_INET
     except ValueError as error:
         raise UserError(f"host: expected an address such as {LOOPBACK} or 0.0.0.0, found {short(host)!r}") from error
-    last: OSError | None = None
+    dualstack, reason = family == socket.AF_INET6 and socket.has_dualstack_ipv6(), ""
     for wanted in (port,) if port else (PORT, 0):
-        listener = socket.socket(family)
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            listener.bind((host, wanted))
-            listener.listen()  # before the address is printed
-        except (OSError, OverflowError) as error:
-            listener.close()
-            last = error if isinstance(error, OSError) else OSError(str(error))
-            continue
-        return listener
-    reason = last.strerror or str(last) if last else ""
+            return socket.create_server((host, wanted), family=family, dualstack_ipv6=dualstack)
+        except OSError as error:
+            reason = error.strerror or str(error)
     raise UserError(f"host, port: expected an address that is free, found {host}:{port} ({reason}); choose another port")
 
 

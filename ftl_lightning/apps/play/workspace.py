@@ -1,4 +1,4 @@
-"""A session with one model on the page: demonstrations, learned concepts and samples of mixtures."""
+"""Session with a model on the page: demonstrations, learned concepts and samples of mixtures."""
 
 import tempfile
 import warnings
@@ -10,8 +10,7 @@ from typing import Any
 
 from ftl_lightning.apps.play import requests
 from ftl_lightning.apps.play.demonstrating import Demonstrating, as_npz
-from ftl_lightning.apps.play.films import Json, films
-from ftl_lightning.apps.play.mixing import Mixture, goal_of, judge_of, judged, samples, sampling_of, starts_of
+from ftl_lightning.apps.play.mixing import Json, Mixture, films, goal_of, judge_of, judged, samples, sampling_of, starts_of
 from ftl_lightning.apps.play.same import VARIABLES, Learned, Part, Sampled, command, python
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.few_shot.learned_concept import LearnedConcept, Learning
@@ -21,14 +20,14 @@ from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import KIND, Concept
 from ftl_lightning.igm.forms.quality import GENERATED
 from ftl_lightning.igm.settings import PAPER
-from ftl_lightning.services.errors import UserError, short
+from ftl_lightning.services.errors import UserError, require, short
 from ftl_lightning.services.tensor_file import kind_of
 
 SHOWN, SHOWN_FIRST = 8, 4
 """Number of samples shown of a learned concept, and during learning."""
-FIRST, EVERY, SHARE = 0.2, 0.5, 3.0
+FIRST, INTERVAL, RATIO = 0.2, 0.5, 3.0
 """Seconds of learning before the first samples, minimum seconds between samples, minimum ratio of learning to sampling time."""
-TOLD = 0.05
+REPORT = 0.05
 """Minimum seconds between reported losses: each report takes time from learning."""
 QUICK: Mapping[str, Any] = {"form": PAPER, "samples": 16, "learning_rate": 0.3}
 QUICK_STEPS = 250
@@ -37,13 +36,18 @@ QUICK_STEPS = 250
 Tell = Callable[[Json], None]
 
 
+def title_of(model: str) -> str:
+    """Title of a model on the page."""
+    return model.rpartition("/")[2].replace("_", " ")
+
+
 class Stopped(Exception):
     """Learning was aborted because no client waits for the result."""
 
 
 @dataclass(frozen=True)
 class Known:
-    """A concept that can be mixed.
+    """Concept that can be mixed.
 
     Attributes:
         name: text of the concept.
@@ -66,29 +70,28 @@ class Known:
     accuracy: float | None = None
 
     @property
-    def form(self) -> str:
-        """Form of the concept in a word or two; empty for training concepts."""
-        if self.concept is None:
-            return ""
-        return self.concept.choice.form if self.concept.choice else "modes" if self.concept.modes else "one set"
+    def content(self) -> Json:
+        """Content for the page's list of concepts; the form is empty for training concepts."""
+        content: Json = {"name": self.name, "kind": self.kind, "count": None, "form": "", "accuracy": self.accuracy}
+        if (concept := self.concept) is not None:
+            content["count"] = concept.origin.count
+            content["form"] = concept.choice.form if concept.choice else "modes" if concept.modes else "one set"
+        return content
 
 
 class Workspace:
-    """One model and the state of its session. No files are written: the browser saves them.
+    """Model and the state of its session. No files are written: the browser saves them.
 
     Args:
         model: name of a shipped model, or a folder.
         root: folder of the user's copy of recordings, for domains whose demonstrations do not ship.
-
-    Raises:
-        UserError: if the model does not exist, or cannot learn concepts.
     """
 
     def __init__(self, model: str, root: Path | None = None) -> None:
         self.name = model
         self._model = FewShot.from_pretrained(model)
         self._domain = self._model.domain
-        self._shown = Demonstrating(self._model, self._domain.source(root))
+        self._demonstrating = Demonstrating(self._model, self._domain.source(root))
         self._count = 0
         self._newest: Learned | None = None
         self._concepts = {
@@ -105,11 +108,11 @@ class Workspace:
         """Initial state of the page."""
         domain, recorder = self._domain, self._domain.recordings.recorder
         return {
-            "title": self.name.rpartition("/")[2].replace("_", " "),
+            "title": title_of(self.name),
             "model": {"name": self.name, "title": domain.name.replace("_", " "), "hash": self._model.model.hash},
             "recorder": recorder and {"kind": recorder.kind, "hint": recorder.hint, "tasks": list(recorder.tasks)},
-            "library": self._shown.library,
-            "uploads": list(self._shown.files),
+            "library": self._demonstrating.library,
+            "uploads": list(self._demonstrating.files),
             "executes": domain.closed_loop is not None and domain.closed_loop.vector_film is not None,
             "groups": list(domain.plans.groups),
             "temperature": self._model.tuned.sampling.temperature,
@@ -122,42 +125,42 @@ class Workspace:
     def work(self) -> dict[str, Any]:
         """Current demonstrations and findings of their check."""
         parts = (Part(self._newest.label, learned=self._newest),) if self._newest else ()
-        return self._shown.told() | {"same": self._same(parts, None)}
+        return self._demonstrating.report() | {"same": self._same(parts, None)}
 
     @property
     def suggestion(self) -> str:
         """Suggested name of the concept: the name of the demonstrations, if a file or the library gave it."""
-        return self._shown.name or "new concept"
+        return self._demonstrating.name or "new concept"
 
-    # Demonstrations.
+    # Demonstrations: each change returns the new work.
 
-    def scene(self, asked: requests.Pose) -> Json:
+    def scene(self, request: requests.Pose) -> Json:
         """Draw a new scene for a demonstration."""
-        return self._shown.scene(asked)
+        return self._demonstrating.scene(request)
 
-    def record(self, asked: requests.Recorded) -> Json:
-        """Add a demonstration recorded by hand; return the new work."""
-        self._shown.record(asked)
+    def record(self, request: requests.Recorded) -> Json:
+        """Add a demonstration recorded by hand."""
+        self._demonstrating.record(request)
         return self.work()
 
-    def draw(self, asked: requests.Drawn) -> Json:
-        """Add demonstrations of the library; return the new work."""
-        self._shown.draw(asked)
+    def draw(self, request: requests.Drawn) -> Json:
+        """Add demonstrations of the library."""
+        self._demonstrating.draw(request)
         return self.work()
 
-    def remove(self, asked: requests.One) -> Json:
-        """Remove a demonstration; return the new work."""
-        self._shown.remove(asked)
+    def remove(self, request: requests.One) -> Json:
+        """Remove a demonstration."""
+        self._demonstrating.remove(request)
         return self.work()
 
-    def undo(self, asked: requests.Nothing) -> Json:
-        """Undo the last change; return the new work."""
-        self._shown.undo()
+    def undo(self, request: requests.Nothing) -> Json:
+        """Undo the last change."""
+        self._demonstrating.undo()
         return self.work()
 
-    def clear(self, asked: requests.Nothing) -> Json:
-        """Remove all demonstrations; return the new work."""
-        self._shown.clear()
+    def clear(self, request: requests.Nothing) -> Json:
+        """Remove all demonstrations."""
+        self._demonstrating.clear()
         return self.work()
 
     def upload(self, name: str, content: bytes) -> None:
@@ -166,12 +169,12 @@ class Workspace:
         Raises:
             UserError: for another kind of file, or a file of another model or domain.
         """
-        if (ending := Path(name).suffix.lower()) not in self._shown.files:
-            raise UserError(f"file: expected one that ends in {' or '.join(self._shown.files)}, found {short(name)!r}")
+        ending, endings = Path(name).suffix.lower(), self._demonstrating.files
+        require(ending in endings, "file", f"a name that ends in {' or '.join(endings)}", repr(short(name)))
         if ending == ".safetensors" and kind_of(content) == KIND:
             self._open(Path(name).name, content)
         else:
-            self._shown.read(name, content)
+            self._demonstrating.read(name, content)
 
     def demonstrations_file(self, key: str) -> tuple[str, bytes]:
         """Name and bytes of an ``.npz`` of the current demonstrations, or of those of a concept learned here.
@@ -180,7 +183,7 @@ class Workspace:
             UserError: if there are none.
         """
         if not key:
-            return "demonstrations.npz", as_npz(self._shown.together(""))
+            return "demonstrations.npz", as_npz(self._demonstrating.together(""))
         known = self._known(key)
         if known.demonstrations is None or known.learned is None:
             raise UserError(f"id: expected a concept that was learned here, found {short(known.name)!r}")
@@ -189,17 +192,18 @@ class Workspace:
     # Concepts.
 
     def _known(self, key: str) -> Known:
-        if (known := self._concepts.get(key)) is None:
-            raise UserError(f"id: expected a concept that is there, found {short(key)!r}")
+        require(key in self._concepts, "id", "an existing concept", repr(short(key)))
+        return self._concepts[key]
+
+    def _editable(self, key: str) -> Known:
+        """Concept that was learned or opened here."""
+        known = self._known(key)
+        require(known.kind in ("learned", "opened"), "id", "a concept that was learned or opened here", "one of the model's")
         return known
 
     def _listed(self) -> list[Json]:
-        return [self._entry(key, known) for key, known in self._concepts.items()]
-
-    def _entry(self, key: str, known: Known) -> Json:
-        count = None if known.concept is None else known.concept.origin.count
-        entry = {"id": key, "name": known.name, "kind": known.kind, "count": count, "form": known.form}
-        return entry | {"accuracy": known.accuracy, "hash": self._model.model.hash}
+        model_hash = self._model.model.hash
+        return [{"id": key, **known.content, "hash": model_hash} for key, known in self._concepts.items()]
 
     def _open(self, name: str, content: bytes) -> None:
         with tempfile.TemporaryDirectory() as folder:
@@ -214,11 +218,7 @@ class Workspace:
         self._concepts[f"o{self._count}"] = Known(concept.concept.origin.name, "opened", concept, concept.concept, name)
 
     def concept_file(self, key: str) -> tuple[str, bytes]:
-        """Name and bytes of a concept's file.
-
-        Raises:
-            UserError: for a training concept, which is part of the model.
-        """
+        """Name and bytes of a concept's file; training concepts have none and are refused."""
         known = self._known(key)
         if known.concept is None:
             raise UserError(f"id: expected a learned concept, found the training concept {short(known.name)!r}")
@@ -227,59 +227,43 @@ class Workspace:
             known.concept.save(path)
             return known.learned.file if known.learned else Path(known.file).name, path.read_bytes()
 
-    def forget(self, asked: requests.Named) -> None:
-        """Remove a concept that was learned or opened here.
+    def forget(self, request: requests.Named) -> None:
+        """Remove a concept that was learned or opened here; concepts of the model are refused."""
+        self._editable(request.id)
+        del self._concepts[request.id]
 
-        Raises:
-            UserError: for a concept of the model.
-        """
-        if self._known(asked.id).kind not in ("learned", "opened"):
-            raise UserError("id: expected a concept that was learned or opened here, found one of the model's")
-        del self._concepts[asked.id]
-
-    def rename(self, asked: requests.Renamed) -> None:
-        """Rename a concept that was learned or opened here, also in its file.
-
-        Raises:
-            UserError: for a concept of the model.
-        """
-        known, name = self._known(asked.id), " ".join(asked.name.split())
-        if known.kind not in ("learned", "opened") or known.concept is None:
-            raise UserError("id: expected a concept that was learned or opened here, found one of the model's")
-        if name == known.name:
+    def rename(self, request: requests.Renamed) -> None:
+        """Rename a concept that was learned or opened here, also in its file; concepts of the model are refused."""
+        known, name = self._editable(request.id), " ".join(request.name.split())
+        if name == known.name or known.concept is None:
             return
         concept = replace(known.concept, origin=replace(known.concept.origin, name=name))
         learned = known.learned and replace(known.learned, label=self._unused(name))
         self._newest = learned if self._newest is known.learned else self._newest
-        self._concepts[asked.id] = replace(known, name=name, concept=concept, learned=learned)
+        self._concepts[request.id] = replace(known, name=name, concept=concept, learned=learned)
 
-    def learn(self, asked: requests.Learn, tell: Tell, stopped: Callable[[], bool]) -> None:
-        """Learn a concept from the demonstrations, and report loss and samples meanwhile.
-
-        Args:
-            asked: name and settings.
-            tell: called with each line for the page.
-            stopped: whether no client waits any more.
+    def learn(self, request: requests.Learn, tell: Tell, stopped: Callable[[], bool]) -> None:
+        """Learn a concept from the demonstrations, and report loss and samples meanwhile by ``tell``.
 
         Raises:
             UserError: without demonstrations, or if they cannot be learned from.
             Stopped: if no client waits.
         """
-        name = " ".join(asked.name.split())
-        demonstrations, begin = self._shown.together(name), monotonic()
-        changes, steps = self._settings(asked.quick)
+        name = " ".join(request.name.split())
+        demonstrations, begin = self._demonstrating.together(name), monotonic()
+        changes, steps = self._settings(request.quick)
         due, reported = begin + FIRST, begin
 
         def watch(now: Learning) -> None:
             nonlocal due, reported
             if stopped():
                 raise Stopped
-            if (clock := monotonic()) >= reported + TOLD or now.step in (1, steps):
+            if (clock := monotonic()) >= reported + REPORT or now.step in (1, steps):
                 tell({"step": now.step, "steps": steps, "loss": round(now.loss, 5)})
                 reported = clock
             if clock >= due:
                 tell({"step": now.step, "samples": self._samples(now.so_far(), SHOWN_FIRST, demonstrations)[0]})
-                due = monotonic() + max(EVERY, SHARE * (monotonic() - clock))
+                due = monotonic() + max(INTERVAL, RATIO * (monotonic() - clock))
 
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the page shows these warnings beside the demonstrations
@@ -295,9 +279,10 @@ class Workspace:
             measured = concept.quality.quality
             quality = {"line": ", ".join(filter(None, (right, measured.words))), "numbers": measured.numbers}
         decided = [film["right"] for film in shown if film["right"] is not None]
-        self._concepts[key] = known = replace(known, accuracy=sum(decided) / len(decided) if decided else None)
+        self._concepts[key] = replace(known, accuracy=sum(decided) / len(decided) if decided else None)
         self._newest = learned
-        result = {"done": True, "concept": self._entry(key, known), "concepts": self._listed(), "quality": quality}
+        concepts = self._listed()
+        result = {"done": True, "concept": concepts[-1], "concepts": concepts, "quality": quality}
         same = self._same((Part(learned.label, learned=learned),), None)
         tell({**result, "samples": shown[:SHOWN], "seconds": round(seconds, 2), "same": same})
 
@@ -320,36 +305,30 @@ class Workspace:
 
     # Samples.
 
-    def sample(self, asked: requests.Sample) -> Json:
+    def sample(self, request: requests.Sample) -> Json:
         """Generate samples of a mixture.
 
         Raises:
             UserError: for an unknown concept or group, or if behaviour cannot be executed.
         """
         begin = monotonic()
-        known = [self._known(part.id) for part in asked.parts]
+        known = [self._known(part.id) for part in request.parts]
         width, plans = self._model.model.config.state_dim, self._domain.plans
-        concepts = [
-            (part.weight * item.composition).on(plans.grouped(part.groups), width)
-            if part.groups
-            else part.weight * item.composition
-            for part, item in zip(asked.parts, known, strict=True)
-        ]
+        concepts, parts, examples = [], [], []
+        for part, item in zip(request.parts, known, strict=True):
+            weighted = part.weight * item.composition
+            concepts.append(weighted.on(plans.grouped(part.groups), width) if part.groups else weighted)
+            parts.append(Part(item.name, part.weight, tuple(part.groups), item.learned, item.file))
+            if (shown_here := item.demonstrations) is not None:
+                examples.append(replace(shown_here, concepts=(item.name,) * len(shown_here)))
         names = [item.name for item in known]
-        examples = [
-            replace(item.demonstrations, concepts=(item.name,) * len(item.demonstrations)) for item in known if item.demonstrations
-        ]
         mixture = Mixture(concepts, names, examples)
-        shown, verdict, how = samples(self._model, mixture, asked, (self._shown.task, *names))
-        parts = [
-            Part(item.name, part.weight, tuple(part.groups), item.learned, item.file)
-            for part, item in zip(asked.parts, known, strict=True)
-        ]
+        shown, verdict, how = samples(self._model, mixture, request, (self._demonstrating.task, *names))
         return {"samples": shown, "told": verdict, "seconds": round(monotonic() - begin, 3), "same": self._same(parts, how)}
 
     def _samples(self, concept: LearnedConcept, count: int, demonstrations: Demonstrations) -> tuple[list[Json], str]:
         """Films of samples of a newly learned concept, and the fraction of correct samples in words."""
-        task, starts = starts_of(self._model, (self._shown.task,), count, 0)
+        task, starts = starts_of(self._model, (self._demonstrating.task,), count, 0)
         plans = self._model.sample(concept, count, starts, seed=0, **sampling_of(self._model))
         judge = judge_of(self._model, [demonstrations])
         return judged(judge, plans, goal_of(judge, (concept.concept.origin.name,), task))
@@ -357,7 +336,7 @@ class Workspace:
     def thumbnail(self, key: str) -> Json:
         """Film of one sample of a concept."""
         known = self._known(key)
-        _, starts = starts_of(self._model, (known.name, self._shown.task), 1, 0)
+        _, starts = starts_of(self._model, (known.name, self._demonstrating.task), 1, 0)
         plans = self._model.sample(known.composition, 1, starts, seed=0, **sampling_of(self._model))
         return {"film": films(self._domain, plans)[0]}
 

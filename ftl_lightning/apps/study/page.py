@@ -15,7 +15,7 @@ from ftl_lightning.apps.study.questions import Questions, film_id
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.films import ABOVE, Wireframe, seen, window
 from ftl_lightning.evaluation.animation import frame_milliseconds, gif
-from ftl_lightning.services.errors import UserError, short
+from ftl_lightning.services.errors import UserError, require, short
 from ftl_lightning.services.escape import script_json
 from ftl_lightning.services.printing import line, plain
 from ftl_lightning.services.schema import read_json
@@ -38,13 +38,7 @@ MILLIMETRES = 1000
 
 @dataclass(frozen=True)
 class Made:
-    """Result of :func:`make_study`.
-
-    Attributes:
-        page, key: paths of the files.
-        study: 16-digit identifier of the study.
-        size: bytes of the page; films: number of films; questions: number of questions for a rater.
-    """
+    """Paths and 16-digit identifier of a study, bytes of its page, and numbers of films and of questions for a rater."""
 
     page: Path
     key: Path
@@ -101,9 +95,8 @@ def _keep_other_keys(path: Path, study: str) -> None:
             existing = read_json(path).get("study")
         except (UserError, OSError, AttributeError):
             existing = "something else"
-        if existing != study:
-            name = short(str(existing))
-            raise UserError(f"{path}: expected no key of another study, found that of {name}; name another folder with --out")
+        found = f"that of {short(str(existing))}; name another folder with --out"
+        require(existing == study, str(path), "no key of another study", found)
 
 
 def _drawings(domain: Domain, questions: Questions) -> dict[str, Any]:

@@ -1,24 +1,173 @@
-"""Questions for raters, and the key with the sources of films and the known answers.
+"""Films of a study, the questions about them, and the key with the sources of films and the known answers.
 
 The raters' page identifies films and questions by random numbers. The key says what they are, and stays with whoever runs the
 study.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from torch import Tensor
 
-from ftl_lightning.apps.study.films import CHECKS, Film
+from ftl_lightning.data.demonstrations import Demonstrations
+from ftl_lightning.domains.domain import Domain
+from ftl_lightning.services.errors import about, require, short, shown
 from ftl_lightning.services.printing import line
+from ftl_lightning.services.schema import from_mapping, read_json
+from ftl_lightning.services.tensor_file import file_hash, visible
 
+LISTING = "films.json"
+TRAINING, NEW = "training", "new"
+"""Settings: concepts of pretraining, and new concepts."""
+CHECKS = {"check-yes": "yes", "check-no": "no"}
+"""Pseudo-methods of films with an obvious answer, and that answer."""
 YES, NO = "yes", "no"
 DEPICTS, BEST = "depicts", "best"
 """The two questions of the paper: whether a film depicts a concept, and which of several films depicts it best."""
 CHECK, REPEAT = "check", "repeat"
 """Questions with a known answer, and repeated questions about the same film."""
 INSTRUCTIONS = {YES: "This question checks attention: please answer Yes.", NO: "This question checks attention: please answer No."}
+
+
+@dataclass(frozen=True)
+class ListedFilm:
+    """Film of a listing; an empty text or a row of -1, which no listing may give, for a default."""
+
+    concept: str
+    method: str
+    file: str
+    scenario: str = ""
+    setting: str = ""
+    row: int = -1
+
+
+@dataclass(frozen=True)
+class Film:
+    """Behaviour shown to raters.
+
+    Attributes:
+        setting: :data:`TRAINING` or :data:`NEW`, or another name from a listing.
+        scenario: unit of comparison between methods: a concept from one initial state.
+        concept: text shown to raters.
+        method: method that generated the behaviour, or one of :data:`CHECKS`.
+        states: ``(time, state)`` in the domain's units.
+        file, row: source of the behaviour.
+        hash: hash of the file.
+    """
+
+    setting: str
+    scenario: str
+    concept: str
+    method: str
+    states: Tensor
+    file: str
+    row: int
+    hash: str
+
+
+def read_films(folder: Path, domain: Domain, scenarios: int, seed: int) -> list[Film]:
+    """Read the films of a folder.
+
+    The folder has either a file ``films.json``, a list of ``{"concept", "method", "file"}`` with optional ``"scenario"``,
+    ``"setting"`` and ``"row"``, or only files named ``METHOD/CONCEPT.safetensors``. Files are outputs of ``sample --out``. The
+    concept is read from the file, or else is the file's name, where an underscore is a space.
+
+    Rows are drawn at random, and are the same for all methods, because equal rows have the same initial state.
+
+    Args:
+        folder: folder of the user.
+        domain: domain of the behaviour.
+        scenarios: number of scenarios of each concept.
+        seed: random seed of rows that are not listed.
+
+    Raises:
+        UserError: for a domain without films, for files that are missing, of another domain or without enough samples, and for a
+            scenario that lacks a method.
+    """
+    filmed = domain.show.film is not None or domain.show.wireframe is not None
+    require(filmed, "domain", "a domain whose plans are filmed", f"{domain.name}, which has no films")
+    require(folder.is_dir(), "films", "a folder of generated behaviour", f"{'a file' if folder.exists() else 'no'} {folder}")
+    listing = folder / LISTING
+    entries = _listed(listing) if listing.is_file() else _named(folder)
+    sources = {entry.file: _source_of(folder / entry.file, domain) for entry in entries}
+    entries = [replace(entry, concept=entry.concept or _concept_of(entry.file, sources[entry.file])) for entry in entries]
+    available: dict[str, int] = {}  # number of samples that every method has of a concept
+    for entry in entries:
+        if entry.method not in CHECKS:
+            count = len(sources[entry.file])
+            available[entry.concept] = min(available.get(entry.concept, count), count)
+    films = []
+    for entry in entries:
+        source, concept = sources[entry.file], entry.concept
+        if entry.row >= 0:
+            rows = [entry.row]
+        elif entry.method in CHECKS:
+            rows = [0]
+        else:
+            where, found = f"{folder / entry.file}: of {concept!r}", f"{available[concept]}; see --scenarios"
+            require(available[concept] >= scenarios, where, f"{scenarios} samples or more in every method's file", found)
+            rows = sorted(np.random.default_rng(seed).permutation(available[concept])[:scenarios].tolist())
+        for row in rows:
+            require(row < len(source), f"{listing}: key 'row' of {entry.file}", f"0 to {len(source) - 1}", row)
+            films.append(
+                Film(
+                    setting=entry.setting or (TRAINING if concept in domain.concepts.training else NEW),
+                    scenario=entry.scenario or (concept if len(rows) == 1 else f"{concept} {row}"),
+                    concept=concept,
+                    method=entry.method,
+                    states=source.states[row, : int(source.lengths[row])],
+                    file=entry.file,
+                    row=row,
+                    hash=file_hash(folder / entry.file),
+                )
+            )
+    _check_scenarios(folder, [film for film in films if film.method not in CHECKS])
+    return films
+
+
+def _named(folder: Path) -> list[ListedFilm]:
+    """Entries of the files in the folders of methods."""
+    paths = visible(folder, "*/*.safetensors")
+    require(paths, str(folder), f"{LISTING} or files METHOD/CONCEPT.safetensors", "neither; make them with: sample --out")
+    return [ListedFilm("", path.parent.name, str(path.relative_to(folder))) for path in paths]
+
+
+def _listed(path: Path) -> list[ListedFilm]:
+    """Entries of a listing."""
+    content = read_json(path)
+    with about(path):
+        require(isinstance(content, list) and content, "films", "a list with one or more films", content)
+        return [from_mapping(ListedFilm, entry, f"films[{number}]") for number, entry in enumerate(content)]
+
+
+def _concept_of(file: str, source: Demonstrations) -> str:
+    """Concept of a file, if it has a single concept; else the file's name."""
+    (concept, *others) = dict.fromkeys(source.concepts)
+    return concept if concept and not others else Path(file).stem.replace("_", " ")
+
+
+def _source_of(path: Path, domain: Domain) -> Demonstrations:
+    """Behaviour of a file, checked for the domain."""
+    source, columns = Demonstrations.load(path), len(domain.plans.columns)
+    require(source.domain in ("", domain.name), str(path), f"behaviour of the domain {domain.name}", source.domain)
+    require(source.states.shape[2] == columns, str(path), f"states of {columns} columns", source.states.shape[2])
+    return source
+
+
+def _check_scenarios(folder: Path, films: Sequence[Film]) -> None:
+    """Refuse scenarios in which a method has no film, or two films."""
+    require(films, str(folder), "films of a method", "checks alone")
+    methods = sorted({film.method for film in films})
+    for scenario in sorted({film.scenario for film in films}):
+        where = f"{folder}: scenario {shown(scenario)}"
+        group = [film for film in films if film.scenario == scenario]
+        settings = short(", ".join(sorted({film.setting for film in group})))
+        require(len({(film.setting, film.concept) for film in group}) == 1, where, "one concept and setting", settings)
+        present = sorted(film.method for film in group)
+        require(present == methods, where, f"a film of each of {short(', '.join(methods))}", short(", ".join(present)))
 
 
 @dataclass(frozen=True)
@@ -48,17 +197,13 @@ def film_id(number: int) -> str:
 
 
 def ask(films: Sequence[Film], repeats: int, still: int, seed: int) -> Questions:
-    """The questions about some films.
+    """Ask whether each film depicts its concept, which film of a scenario depicts it best, and checks.
 
     Args:
         films: one film of each method in every scenario, and checks.
         repeats: number of questions that are asked twice.
         still: number of films that are repeated as a standing picture, which depicts no motion.
         seed: random seed of the numbers, and of the repeated and standing films.
-
-    Returns:
-        Whether each film depicts its concept; two questions that state their answer, and the other checks; which film depicts a
-        scenario's concept best.
     """
     rng = np.random.default_rng(seed)
     real = [film for film in films if film.method not in CHECKS]

@@ -1,25 +1,217 @@
-"""The paper's table of a study: how often each method depicts a concept, and how often it depicts it best."""
+"""Answers of raters, and the paper's table of a study: how often each method depicts a concept, and how often it does so best."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 from rich import box
 from rich.table import Table
 from scipy.stats import binomtest
 
-from ftl_lightning.apps.study.agreement import krippendorff_alpha
-from ftl_lightning.apps.study.answers import Key, Rater, inattention, read_key, read_raters
-from ftl_lightning.apps.study.films import NEW, TRAINING
-from ftl_lightning.apps.study.questions import BEST, DEPICTS, YES
+from ftl_lightning.apps.study.page import FORMAT, KEY_KIND
+from ftl_lightning.apps.study.questions import BEST, CHECK, DEPICTS, NEW, NO, REPEAT, TRAINING, YES
 from ftl_lightning.evaluation.summary import literal
-from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.errors import UserError, about, require, short, shown
 from ftl_lightning.services.printing import line
+from ftl_lightning.services.schema import from_mapping, read_json
 
+ANSWERS_KIND = "study answers"
+REPEATS_THAT_MAY_DIFFER = 0.5
+"""Maximum fraction of repeated questions that an attentive rater may answer inconsistently."""
 LABELS = {BEST: "judged best", DEPICTS: "depicts the concept"}
 """Labels of the questions, in the order of the paper's table."""
+NOTES = (
+    "mean ± standard deviation over raters of each rater's mean over scenarios, as in the paper; in brackets Wilson's 95 %",
+    "interval, which takes answers as independent and is too narrow where they are not; alpha: Krippendorff's, nominal",
+)
+"""Notes below the table."""
+
+
+@dataclass(frozen=True)
+class Question:
+    """Meaning of a question.
+
+    Attributes:
+        kind, text, films: kind, text, and ids of the films.
+        expected: known answer of a check.
+        scenario, setting: scenario and setting of a comparison.
+    """
+
+    kind: Literal["depicts", "best", "check", "repeat"]
+    text: str
+    films: tuple[str, ...]
+    expected: str = ""
+    scenario: str = ""
+    setting: str = ""
+
+
+@dataclass(frozen=True)
+class FilmSource:
+    """Source of a film; ``still`` for a film that is shown as its first state only."""
+
+    setting: str
+    scenario: str
+    concept: str
+    method: str
+    file: str
+    row: int
+    hash: str
+    still: bool = False
+
+
+@dataclass(frozen=True)
+class Key:
+    """Meaning of a study's questions and films.
+
+    Attributes:
+        study, page: 16-digit identifiers of the study and of its page.
+        questions, films: by id.
+    """
+
+    study: str
+    page: str
+    questions: Mapping[str, Question]
+    films: Mapping[str, FilmSource]
+
+    def of_kind(self, kind: str) -> dict[str, Question]:
+        """Questions of a kind, by id."""
+        return {name: question for name, question in self.questions.items() if question.kind == kind}
+
+    def repeated(self) -> dict[str, str]:
+        """Id of the original of each repeated question; empty if there is none."""
+        original = {(question.text, question.films): name for name, question in self.of_kind(DEPICTS).items()}
+        return {name: original.get((question.text, question.films), "") for name, question in self.of_kind(REPEAT).items()}
+
+
+@dataclass(frozen=True)
+class Rater:
+    """Answers of a person by question id: ``'yes'``, ``'no'``, or a film's id; the name is 16 digits drawn by the browser."""
+
+    file: Path
+    name: str
+    answers: Mapping[str, str]
+
+
+def _json(path: Path, kind: str) -> dict[str, Any]:
+    content = read_json(path, f"a {kind} file")
+    actual = content.get("kind") if isinstance(content, dict) else None
+    description = f"a {short(str(actual))} file" if actual else "a file of other software"
+    require(actual == kind, str(path), f"a {kind} file", description)
+    version = content.get("format")
+    require(version == FORMAT, f"{path}: key 'format'", str(FORMAT), f"{shown(version)}; it is of another version")
+    return dict(content)
+
+
+def read_key(path: Path) -> Key:
+    """Read the key written by ``study``.
+
+    Raises:
+        UserError: naming the file, if it is missing, damaged or of another kind.
+    """
+    content = _json(path, KEY_KIND)
+    with about(path):
+        key = from_mapping(Key, {name: content[name] for name in ("study", "page", "questions", "films") if name in content}, "")
+        for name, question in key.questions.items():
+            known = question.films and {*question.films} <= key.films.keys()
+            require(known, f"key 'questions.{short(name)}.films'", "some of the key's films", short(", ".join(question.films)))
+            complete = {CHECK: question.expected, BEST: question.setting and question.scenario}.get(question.kind, True)
+            require(
+                complete, f"key 'questions.{short(name)}'", "what a check expects, or a comparison's scenario and setting", "none"
+            )
+        require(all(key.repeated().values()), "key 'questions'", "the original of each repeated question", "none")
+    return key
+
+
+def read_rater(path: Path, key: Key) -> Rater:
+    """Read one file of answers.
+
+    Raises:
+        UserError: naming the file, if it is missing, damaged, of another study, of another page, or not finished.
+    """
+    content = _json(path, ANSWERS_KIND)
+    for part, expected in (("study", key.study), ("page", key.page)):
+        found = f"{shown(content.get(part))}; the answers are of another {part}"
+        require(content.get(part) == expected, f"{path}: key {part!r}", expected, found)
+    name, given = content.get("rater"), content.get("answers")
+    if not isinstance(name, str) or not name or not isinstance(given, list):
+        raise UserError(f"{path}: expected a rater and a list of answers, found a damaged file")
+    answers: dict[str, str] = {}
+    for entry in given:
+        if entry is None:  # a question that was not reached
+            continue
+        identifier = entry.get("id") if isinstance(entry, dict) else None
+        question = key.questions.get(identifier) if isinstance(identifier, str) else None
+        if question is None or entry["id"] in answers:
+            raise UserError(f"{path}: key 'answers': expected one answer to each question, found {shown(entry)}")
+        allowed, answer = question.films if question.kind == BEST else (YES, NO), entry.get("answer")
+        require(answer in allowed, f"{path}: answer to {entry['id']}", " or ".join(allowed), shown(answer))
+        answers[entry["id"]] = entry["answer"]
+    finished = content.get("finished") and len(answers) == len(key.questions)
+    expected = f"{len(key.questions)} answers of a finished run"
+    require(finished, str(path), expected, f"{len(answers)}; finish it in the same browser")
+    return Rater(path, name, answers)
+
+
+def read_raters(paths: Sequence[Path], key: Key) -> tuple[list[Rater], list[str]]:
+    """Read files, or folders with files ``answers*.json``: unique raters, and one line for each refused file."""
+    files: list[Path] = []
+    refused: list[str] = []
+    for path in paths:
+        inside = sorted(path.glob("answers*.json")) if path.is_dir() else [path]
+        if not inside:
+            refused.append(f"{path}: expected files answers*.json in this folder, found none")
+        files += inside
+    raters: dict[str, Rater] = {}
+    for path in dict.fromkeys(files):
+        try:
+            rater = read_rater(path, key)
+            expected = f"another rater than {raters.get(rater.name, rater).file} has"
+            require(rater.name not in raters, str(path), expected, "the same; keep one of the two")
+            raters[rater.name] = rater
+        except UserError as error:
+            refused.append(str(error))
+    return list(raters.values()), refused
+
+
+def inattention(rater: Rater, key: Key) -> str:
+    """Reason to exclude a rater's answers; empty if they count.
+
+    A rater fails by answering any check wrongly, or more than :data:`REPEATS_THAT_MAY_DIFFER` of the repeated questions
+    inconsistently.
+    """
+    checks = key.of_kind(CHECK)
+    wrong = sum(rater.answers[name] != question.expected for name, question in checks.items())
+    if wrong:
+        return f"{wrong} of {len(checks)} attention checks answered wrongly"
+    pairs = key.repeated()
+    differ = sum(rater.answers[repeat] != rater.answers[original] for repeat, original in pairs.items())
+    if differ > REPEATS_THAT_MAY_DIFFER * len(pairs):
+        return f"{differ} of {len(pairs)} questions that were asked twice answered in two ways"
+    return ""
+
+
+def krippendorff_alpha(units: Iterable[Sequence[Hashable]]) -> float:
+    """Krippendorff's alpha of categories without an order: 1 for full agreement, 0 for agreement by chance, negative for less.
+
+    ``1 - D_observed / D_expected``, see K. Krippendorff, "Computing Krippendorff's Alpha-Reliability", 2011, part C and D.
+
+    Args:
+        units: for each item, the categories given by raters, in any order; items with fewer than two ratings do not count.
+
+    Returns:
+        alpha, or NaN if nothing varies, because agreement is then indistinguishable from habit.
+    """
+    paired = [Counter(unit) for unit in units if len(unit) > 1]
+    totals = sum(paired, Counter())
+    count = totals.total()
+    # Pairs within a unit that differ, each unit with a weight that makes every value count once.
+    observed = sum((u.total() ** 2 - sum(n * n for n in u.values())) / (u.total() - 1) for u in paired)
+    expected = count**2 - sum(n * n for n in totals.values())
+    return 1 - (count - 1) * observed / expected if expected else math.nan
 
 
 @dataclass(frozen=True)
@@ -114,28 +306,26 @@ def study_table(answers: Sequence[Path], key: Path, keep_all: bool = False) -> R
 
 
 def _counted(key: Key, raters: Sequence[Rater], dropped: tuple[str, ...], refused: tuple[str, ...]) -> Report:
-    said: dict[tuple[str, str, str], dict[str, list[bool]]] = {}
-    """By setting, question and method, then by rater: whether the method was chosen, in each scenario."""
+    # By setting, question and method, then by rater: whether the method was chosen, in each scenario.
+    chosen: dict[tuple[str, str, str], dict[str, list[bool]]] = {}
     units: dict[tuple[str, str], list[list[str]]] = {}
     scenarios: dict[str, set[str]] = {}
     for name, question in key.of_kind(DEPICTS).items():
-        film = key.films[question["films"][0]]
-        setting, method = film["setting"], film["method"]
-        scenarios.setdefault(setting, set()).add(film["scenario"])
-        units.setdefault((setting, DEPICTS), []).append([rater.answers[name] for rater in raters])
+        film = key.films[question.films[0]]
+        scenarios.setdefault(film.setting, set()).add(film.scenario)
+        units.setdefault((film.setting, DEPICTS), []).append([rater.answers[name] for rater in raters])
+        where = (film.setting, DEPICTS, film.method)
         for rater in raters:
-            said.setdefault((setting, DEPICTS, method), {}).setdefault(rater.name, []).append(rater.answers[name] == YES)
+            chosen.setdefault(where, {}).setdefault(rater.name, []).append(rater.answers[name] == YES)
     for name, question in key.of_kind(BEST).items():
-        setting = question["setting"]
-        units.setdefault((setting, BEST), []).append([key.films[rater.answers[name]]["method"] for rater in raters])
+        units.setdefault((question.setting, BEST), []).append([key.films[rater.answers[name]].method for rater in raters])
         for rater in raters:
-            for film_name in question["films"]:
-                chosen = rater.answers[name] == film_name
-                method = key.films[film_name]["method"]
-                said.setdefault((setting, BEST, method), {}).setdefault(rater.name, []).append(chosen)
+            for film_name in question.films:
+                where = (question.setting, BEST, key.films[film_name].method)
+                chosen.setdefault(where, {}).setdefault(rater.name, []).append(rater.answers[name] == film_name)
     order = sorted(scenarios, key=lambda name: ({TRAINING: 0, NEW: 1}.get(name, 2), name))
     return Report(
-        shares={where: _share(list(by_rater.values())) for where, by_rater in said.items()},
+        shares={where: _share(list(by_rater.values())) for where, by_rater in chosen.items()},
         agreement={where: krippendorff_alpha(ratings) for where, ratings in units.items()},
         scenarios={setting: len(scenarios[setting]) for setting in order},
         raters=len(raters),
@@ -150,10 +340,3 @@ def _share(by_rater: Sequence[Sequence[bool]]) -> Share:
     answers = sum(map(len, by_rater))
     interval = binomtest(sum(map(sum, by_rater)), answers).proportion_ci(method="wilson")
     return Share(100 * float(means.mean()), 100 * float(means.std()), 100 * interval.low, 100 * interval.high, answers)
-
-
-NOTES = (
-    "mean ± standard deviation over raters of each rater's mean over scenarios, as in the paper; in brackets Wilson's 95 %",
-    "interval, which takes answers as independent and is too narrow where they are not; alpha: Krippendorff's, nominal",
-)
-"""Notes below the table."""

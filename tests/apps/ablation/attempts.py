@@ -10,8 +10,8 @@ import pandas as pd
 import pytest
 
 from ftl_lightning.apps.ablation import run
-from ftl_lightning.apps.ablation.outcome import Outcome
 from ftl_lightning.apps.ablation.plan import Cell
+from ftl_lightning.apps.ablation.record import Outcome
 from ftl_lightning.evaluation.results import Row
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import yaml
 
-from ftl_lightning.apps.ablation.record import Entry, read_record
+from ftl_lightning.apps.ablation.record import CellRecord, read_record
 from tests.conftest import CONF, ROOT, environment
 
 WAIT = 300.0
@@ -102,12 +102,12 @@ def until(there: Callable[[], Any], process: "subprocess.Popen[str]", folder: Pa
     return found
 
 
-def entries(folder: Path, state: str) -> dict[str, Entry]:
+def entries(folder: Path, state: str) -> dict[str, CellRecord]:
     """Of a grid's cells those in a state."""
     return {name: entry for name, entry in read_record(folder / "r.csv").items() if entry.state == state}
 
 
-def node_of(entry: Entry, made: Any) -> Any:
+def node_of(entry: CellRecord, made: Any) -> Any:
     """The node of a cluster that a cell runs on."""
     begins = entry.node.rpartition("/")[2]
     return next((node for node in (made.head_node, *made.worker_nodes) if node.node_id.startswith(begins)), None)

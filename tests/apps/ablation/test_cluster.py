@@ -14,9 +14,8 @@ import pandas as pd
 import pytest
 
 from ftl_lightning.apps.ablation import cluster, run
-from ftl_lightning.apps.ablation.outcome import Attempt, Outcome
-from ftl_lightning.apps.ablation.plan import Cell, Stage
-from ftl_lightning.apps.ablation.resources import Resources, read_resources
+from ftl_lightning.apps.ablation.plan import Cell, Resources, Stage
+from ftl_lightning.apps.ablation.record import Attempt, Outcome
 from ftl_lightning.cli.main import main
 from ftl_lightning.evaluation.results import read_rows
 from ftl_lightning.services.errors import UserError
@@ -26,7 +25,7 @@ from tests.conftest import ROOT, refused
 
 
 def cell(name: str, **resources: float) -> Cell:
-    return Cell("invert", (), {}, "", name, read_resources(resources))
+    return Cell("invert", (), {}, "", name, Resources.read(resources))
 
 
 @pytest.fixture(scope="module")
@@ -221,7 +220,7 @@ def test_what_has_no_machine_is_refused_or_given_up_and_a_silent_head_ends_the_g
 
 
 def test_resources_are_said_in_the_words_of_ray_and_refused_where_they_cannot_be_booked() -> None:
-    found = read_resources({"cpus": 4, "gpus": 0.5, "memory_gb": 2, "big": 1})
+    found = Resources.read({"cpus": 4, "gpus": 0.5, "memory_gb": 2, "big": 1})
     assert found.ray() == {"num_cpus": 4, "num_gpus": 0.5, "memory": 2_000_000_000, "resources": {"big": 1}}
     assert Resources().ray() == {"num_cpus": 1, "num_gpus": 0}
     assert str(found) == "cpus 4, gpus 0.5, memory_gb 2, big 1"
@@ -229,10 +228,10 @@ def test_resources_are_said_in_the_words_of_ray_and_refused_where_they_cannot_be
         ({"cpus": 1.5}, "resources.cpus: expected a whole number of 0 or more, or a fraction of 1, found 1.5"),
         ({"gpus": -1}, "resources.gpus: expected a whole number"),
         ({"memory_gb": float("nan")}, "resources.memory_gb: expected a number of 0 or more, found nan"),
-        ({"big one": 1}, "resources: expected cpus, gpus, memory_gb or a resource of the cluster's own, found 'big one'"),
+        ({"big one": 1}, "resources: expected cpus, gpus, memory_gb or a custom resource of the cluster, found big one"),
     ):
         with pytest.raises(UserError, match=told.replace("'", "."), check=lambda error: "\n" not in str(error)):
-            read_resources(asked)
+            Resources.read(asked)
 
 
 def test_a_cluster_that_is_none_is_told_in_one_line(

@@ -4,9 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from ftl_lightning.apps.ablation.estimate import estimate, makespan, seconds_of
 from ftl_lightning.apps.ablation.plan import Cell, Stage
-from ftl_lightning.apps.ablation.record import Entry, read_record, record_path, tell
+from ftl_lightning.apps.ablation.record import CellRecord, estimate, makespan, read_record, record_path, seconds_of, tell
 from ftl_lightning.cli.main import main
 from ftl_lightning.services.errors import UserError
 from tests.apps.ablation.attempts import nothing_is_run  # noqa: F401
@@ -27,7 +26,7 @@ def test_cells_go_to_the_worker_that_is_free_and_stages_wait_for_one_another() -
 
 def test_a_cell_is_measured_by_itself_or_else_by_its_nearest() -> None:
     one, other = cells(0)
-    entries = {one.name: Entry("done", one.configs, seconds=100), other.name: Entry("done", other.configs, seconds=300)}
+    entries = {one.name: CellRecord("done", one.configs, seconds=100), other.name: CellRecord("done", other.configs, seconds=300)}
     assert seconds_of(one, entries) == seconds_of(cells(1)[0], entries) == 100
     new = next(Stage("invert", "a.yaml", name="new").cells(0))
     assert seconds_of(new, entries) == 200
@@ -40,10 +39,10 @@ def test_an_estimate_says_what_it_does_not_know() -> None:
     assert estimate([[]], {}, 4) == ["4 cells: 4 need not be run, 0 to run"]
     assert "not known, as no cell like them was measured" in estimate([plan], {}, 4)[-1]
     other = next(Stage("fit", "a.yaml").cells(0))
-    lines = estimate([[other], plan], {first.name: Entry("done", first.configs, seconds=3600)}, 9)
+    lines = estimate([[other], plan], {first.name: CellRecord("done", first.configs, seconds=3600)}, 9)
     assert lines == [
         "9 cells: 4 need not be run, 5 to run",
-        "not known: 1 of them, none like which was measured, such as fit a, seed 0; their time comes on top",
+        "not known: 1 of them, without a similar measured cell, such as fit a, seed 0; their time is added",
         "measured: 1 of them before, 3 estimated from other seeds or options of the same files",
         "1 at a time: 4.0 hours",
         "2 at a time: 2.0 hours",
@@ -58,10 +57,10 @@ def test_the_record_keeps_what_was_measured_and_refuses_what_it_did_not_write(tm
     told = (("running", "n1"), ("again", "n1", "lost\nits node"), ("running", "n2"), ("done", "", "4 rows", 12.345))
     for state in told:
         tell("r.csv", [one], *state)
-    entry = Entry("done", ("a.yaml",), "n2", 2, 12.35, "4 rows")
-    assert read_record("r.csv") == {one.name: entry, other.name: Entry("queued", ("a.yaml",))}
+    entry = CellRecord("done", ("a.yaml",), "n2", 2, 12.35, "4 rows")
+    assert read_record("r.csv") == {one.name: entry, other.name: CellRecord("queued", ("a.yaml",))}
     tell("r.csv", [one], "queued")
-    assert read_record("r.csv")[one.name] == Entry("queued", ("a.yaml",), seconds=12.35)
+    assert read_record("r.csv")[one.name] == CellRecord("queued", ("a.yaml",), seconds=12.35)
     record_path("r.csv").write_text('{"kind": "cells of an ablation", "format": 2, "cells": {}}')
     with pytest.raises(UserError, match=r"r.cells.json: expected cells of an ablation of format 1, found another file; remove it"):
         read_record("r.csv")

@@ -13,8 +13,7 @@ import torch
 
 from ftl_lightning.apps.benchmark.check import allowed, check_submission, drawn
 from ftl_lightning.apps.benchmark.leaderboard import leaderboard, read_submissions
-from ftl_lightning.apps.benchmark.run import scored
-from ftl_lightning.apps.benchmark.submission import Submission
+from ftl_lightning.apps.benchmark.submission import Submission, scored
 from ftl_lightning.cli.main import main
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.services.errors import LONGEST
@@ -130,7 +129,7 @@ TAMPERED: list[tuple[Callable[[Any], None], str]] = [
     (lambda content: content["runs"].pop(), "runs: expected one of beats, seed 2, found none"),
     (lambda content: content["runs"].append(content["runs"][0]), "runs[3]: expected one run of beats, seed 0, found two"),
     (_set("runs.0.seed", 7), "runs[0].seed: expected one of [0, 1, 2], found 7"),
-    (_set("runs.0.suite", "agent"), "runs[0].suite: expected one of beats, found 'agent'"),
+    (_set("runs.0.suite", "agent"), "runs[0].suite: expected one of beats, found agent"),
     (_set("runs.0.model", "../../etc"), "beats, seed 0: model: expected a hash of 16 digits"),
     (_set("runs.0.data.demonstrations", "0123456789abcdef"), "data.demonstrations: expected the frozen data's hash"),
     (_set("runs.0.data", {}), "beats, seed 0: data.training: expected the frozen data's hash"),
@@ -180,7 +179,7 @@ def test_numbers_that_agree_with_one_another_but_were_never_measured_are_found(
 
 def test_another_method_is_not_run_for_a_submission(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
     told = line_of(capsys, "bc", "--check", str(copy))
-    assert "method: expected 'replay', which the submission is of, found 'bc'" in told
+    assert "method: expected 'replay', the method of the submission, found 'bc'" in told
 
 
 HOSTILE = [

@@ -8,24 +8,24 @@ import torch
 
 from ftl_lightning.apps.benchmark import families
 from ftl_lightning.apps.benchmark.families import CHANCE, ORACLE
-from ftl_lightning.apps.benchmark.suite import DEMONSTRATIONS, SEEDS, STARTS, TRAINING, load_suite, suite_names
+from ftl_lightning.apps.benchmark.suite import DEMONSTRATIONS, FAMILIES, SEEDS, STARTS, TRAINING, load_suite, suite_names
 from ftl_lightning.cli.main import main
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.services.errors import UserError
 from tests.conftest import ROOT
 
-FAMILIES = ("beats", "pictures", "reaches", "strokes")
-
 
 def test_there_are_five_domains_and_four_families() -> None:
+    assert set(FAMILIES) == {"beats", "pictures", "reaches", "strokes"}
     assert set(suite_names()) == {*FAMILIES, "object_rearrangement", "agent", "driving", "mocap", "tabletop"}
 
 
 @pytest.mark.parametrize("name", suite_names())
 def test_a_suite_asks_what_its_domain_does(name: str) -> None:
     suite = load_suite(name)
-    domain = load_domain(suite.domain)
+    domain = load_domain(suite.domain_reference)
     assert suite.name == name
+    assert ":" not in suite.domain  # the suite's hash does not depend on a module
     assert tuple(suite.training.concepts) == domain.concepts.training
     asked = {(task.setting, task.name): task for task in domain.concepts.suites[suite.test_suite].tasks}
     assert {(task.setting, task.concept) for task in suite.test} <= set(asked)
@@ -43,7 +43,7 @@ def test_a_suite_asks_what_its_domain_does(name: str) -> None:
 @pytest.mark.parametrize("name", [name for name in suite_names() if name != "mocap"])
 def test_every_seed_has_hashes(name: str) -> None:
     suite = load_suite(name)
-    parts = {DEMONSTRATIONS, STARTS} if load_domain(suite.domain).observed else {DEMONSTRATIONS, TRAINING}
+    parts = {DEMONSTRATIONS, STARTS} if load_domain(suite.domain_reference).observed else {DEMONSTRATIONS, TRAINING}
     assert {seed: parts <= set(found) for seed, found in suite.data.items()} == {str(seed): True for seed in SEEDS}
 
 
@@ -51,7 +51,7 @@ def test_every_seed_has_hashes(name: str) -> None:
 def test_demonstrations_are_the_frozen_ones(name: str) -> None:
     suite = load_suite(name)
     suite.check_data(0, None, (DEMONSTRATIONS,))
-    found = suite.prints(1, None, (DEMONSTRATIONS,))[DEMONSTRATIONS]
+    found = suite.fingerprints(1, None, (DEMONSTRATIONS,))[DEMONSTRATIONS]
     assert found.is_near(suite.data["1"][DEMONSTRATIONS])
     assert not found.is_near(suite.data["0"][DEMONSTRATIONS])
 
@@ -85,7 +85,7 @@ def test_rounding_in_another_way_is_no_other_data() -> None:
 @pytest.mark.parametrize("name", FAMILIES)
 def test_the_judge_knows_fresh_behaviour_and_nothing_else(name: str) -> None:
     suite = load_suite(name)
-    domain = load_domain(suite.domain)
+    domain = load_domain(suite.domain_reference)
     every = len(suite.training.concepts) + len(suite.validation) + len(suite.test)
     for task in suite.test[:2]:
         rates = {

@@ -74,7 +74,7 @@ def test_the_page_is_there_with_samples_before_anything_is_done(page: Browser) -
 
 
 def test_five_arrangements_become_a_concept(page: Browser, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(workspace, "TOLD", 0.0)  # every loss, however fast this machine is
+    monkeypatch.setattr(workspace, "REPORT", 0.0)  # every loss, however fast this machine is
     for _ in range(5):
         arrange(page)
     learned(page)

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import torch
 
+from ftl_lightning.apps.benchmark.strokes import strokes
 from ftl_lightning.apps.play.page import page, request_key
-from ftl_lightning.apps.testing.strokes import strokes
 from ftl_lightning.domains.pictures import path_film
 from ftl_lightning.evaluation.films import packed
 

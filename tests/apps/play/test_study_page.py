@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from ftl_lightning.apps.study.answers import read_key
 from ftl_lightning.apps.study.page import Made
+from ftl_lightning.apps.study.report import read_key
 from ftl_lightning.cli.main import main
 from tests.study import make, write_films
 
@@ -121,7 +121,7 @@ def test_somebody_rates_everything_with_a_break_and_the_report_takes_the_file(
 
 def test_raters_see_films_in_other_orders_and_repeats_apart(study: Made, rater: Rater) -> None:
     key, page, orders = read_key(study.key), rater.page, []
-    repeated = [tuple(question["films"]) for question in key.of_kind("repeat").values()]
+    repeated = [question.films for question in key.of_kind("repeat").values()]
     for _ in range(2):
         page.js("localStorage.clear()")
         page.driver.refresh()
@@ -133,9 +133,9 @@ def test_raters_see_films_in_other_orders_and_repeats_apart(study: Made, rater: 
     assert sorted(orders[0]) == sorted(orders[1]) == sorted(key.questions)
     assert orders[0] != orders[1]
     for order in orders:
-        kinds = [key.questions[name]["kind"] == "best" for name in order]
+        kinds = [key.questions[name].kind == "best" for name in order]
         assert kinds == sorted(kinds)  # films alone come first
-        asked = [tuple(key.questions[name]["films"]) for name in order]
+        asked = [key.questions[name].films for name in order]
         for films in repeated:
             first, second = [place for place, found in enumerate(asked) if found == films][:2]
             assert second - first > 1

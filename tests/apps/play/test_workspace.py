@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 import torch
 
+from ftl_lightning.apps.benchmark.strokes import drawn
 from ftl_lightning.apps.play import requests, workspace
-from ftl_lightning.apps.play.films import Json
+from ftl_lightning.apps.play.mixing import Json
 from ftl_lightning.apps.play.same import VARIABLES, Learned
 from ftl_lightning.apps.play.workspace import Stopped, Workspace
-from ftl_lightning.apps.testing.more_strokes import drawn
 from ftl_lightning.cli.main import main
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.igm.concept import Concept
@@ -48,7 +48,7 @@ def taught(first: Workspace) -> Taught:
     """The same after a concept was learned, and what was told; samples are shown once on the way."""
     changed = copy.deepcopy(first)
     with pytest.MonkeyPatch.context() as patch:
-        for name, seconds in {"FIRST": 0.0, "EVERY": 1e9, "TOLD": 0.0}.items():
+        for name, seconds in {"FIRST": 0.0, "INTERVAL": 1e9, "REPORT": 0.0}.items():
             patch.setattr(workspace, name, seconds)
         patch.setattr(Workspace, "_settings", quickly)
         return changed, learn(changed)
