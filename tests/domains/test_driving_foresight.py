@@ -9,8 +9,7 @@ import pytest
 from ftl_lightning.domains.driving.environment import DrivingEnvironment
 from ftl_lightning.domains.driving.expert import BLIND, Blind, plan_blind
 from ftl_lightning.domains.driving.foresight import FRAMES, VETOES, Beliefs, Foresight, Worlds
-from ftl_lightning.domains.driving.scenarios import EXITS, SCENARIOS, make
-from ftl_lightning.domains.driving.simulation import save
+from ftl_lightning.domains.driving.scenarios import EXITS, SCENARIOS, make, save
 from ftl_lightning.domains.driving.traffic import BELIEF, SIMULATION, STEP
 
 

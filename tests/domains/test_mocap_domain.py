@@ -10,13 +10,11 @@ import torch
 from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.mocap import DOMAIN, skeleton
-from ftl_lightning.domains.mocap.measures import MEASURES, bone_error
-from ftl_lightning.domains.mocap.recordings import FILE, Recordings
-from ftl_lightning.domains.mocap.segments import SEGMENTS
+from ftl_lightning.domains.mocap.domain import with_rigid_bones
+from ftl_lightning.domains.mocap.measures import bone_error
 from ftl_lightning.domains.mocap.skeleton import HORIZON, R_WRIST, as_joints, bone_lengths, mirrored
-from ftl_lightning.domains.mocap.source import LONGEST, POSE, Recorded, at_rest, glitches, hang_down, pieces
-from ftl_lightning.domains.mocap.tasks import HELD_OUT, NEW_CONCEPTS, SUITES, TRAINING_CONCEPTS, cleaned, mirrored_text
-from ftl_lightning.domains.mocap.views import with_rigid_bones
+from ftl_lightning.domains.mocap.source import FILE, LONGEST, POSE, Recorded, Recordings, at_rest, glitches, hang_down, pieces
+from ftl_lightning.domains.mocap.tasks import HELD_OUT, NEW_CONCEPTS, SEGMENTS, SUITES, TRAINING_CONCEPTS, cleaned, mirrored_text
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.training.data import InversionData, PretrainingData, shares
 from tests.domains.mocap_samples import folder, motion, named_recordings, recordings
@@ -103,7 +101,7 @@ def test_a_frozen_frame_is_still_has_its_bones_and_is_no_action() -> None:
     starts = DOMAIN.source(None).starts("walk", 4, 0)
     plans = DOMAIN.references["frozen frame"]("walk", 4, starts, 0)
     found = DOMAIN.measure("walk", plans, starts)
-    assert set(found) == set(MEASURES)
+    assert set(found) == set(DOMAIN.metrics)
     assert not found["accuracy"].any()
     assert found["jerk"].max() < 1
     assert found["bone error"].max() < 1e-4

@@ -11,11 +11,10 @@ from torch import Tensor
 
 from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.domains.mocap import skeleton
-from ftl_lightning.domains.mocap.export import HIPS, TREE, bvh
-from ftl_lightning.domains.mocap.recordings import read_folder
-from ftl_lightning.domains.mocap.skeleton import as_joints
-from ftl_lightning.domains.mocap.standing import standing_poses
-from ftl_lightning.domains.mocap.views import with_rigid_bones
+from ftl_lightning.domains.mocap.bvh import HIPS, TREE, bvh
+from ftl_lightning.domains.mocap.domain import with_rigid_bones
+from ftl_lightning.domains.mocap.skeleton import as_joints, standing_poses
+from ftl_lightning.domains.mocap.source import read_folder
 from ftl_lightning.services.errors import UserError
 from tests.conftest import ROOT, refused, succeed
 from tests.domains.mocap_samples import named_recordings

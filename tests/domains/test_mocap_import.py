@@ -8,12 +8,10 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.data.container import Demonstrations
-from ftl_lightning.domains.mocap.bvh_file import read_motion
-from ftl_lightning.domains.mocap.domain import DOMAIN
-from ftl_lightning.domains.mocap.skeleton import FPS, HORIZON
+from ftl_lightning.domains.mocap.bvh import read_motion
+from ftl_lightning.domains.mocap.domain import DOMAIN, with_rigid_bones
+from ftl_lightning.domains.mocap.skeleton import FPS, HORIZON, standing_poses
 from ftl_lightning.domains.mocap.source import LONGEST
-from ftl_lightning.domains.mocap.standing import standing_poses
-from ftl_lightning.domains.mocap.views import with_rigid_bones
 from ftl_lightning.services.errors import LONGEST as LINE
 from ftl_lightning.services.errors import UserError
 from tests.domains.test_mocap_reading import bvh as converted

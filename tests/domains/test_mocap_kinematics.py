@@ -5,13 +5,23 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.data.features import InitialStates
-from ftl_lightning.domains.mocap import kinematics, measures
-from ftl_lightning.domains.mocap.domain import DOMAIN
-from ftl_lightning.domains.mocap.kinematics import RULES
-from ftl_lightning.domains.mocap.skeleton import HORIZON, L_ANKLE, L_KNEE, L_WRIST, R_ANKLE, R_KNEE, R_WRIST, as_joints
+from ftl_lightning.domains.mocap import measures
+from ftl_lightning.domains.mocap.domain import BLENDED, DOMAIN, VIEWS, begun_elsewhere, smoothed, with_rigid_bones
+from ftl_lightning.domains.mocap.measures import RULES
+from ftl_lightning.domains.mocap.skeleton import (
+    HORIZON,
+    L_ANKLE,
+    L_KNEE,
+    L_WRIST,
+    R_ANKLE,
+    R_KNEE,
+    R_WRIST,
+    as_joints,
+    drawn_poses,
+    standing_poses,
+    walking_poses,
+)
 from ftl_lightning.domains.mocap.source import POSE
-from ftl_lightning.domains.mocap.standing import drawn_poses, standing_poses, walking_poses
-from ftl_lightning.domains.mocap.views import BLENDED, VIEWS, begun_elsewhere, smoothed, with_rigid_bones
 
 TIME = torch.linspace(0, 1, HORIZON)
 PHASE = (1 - torch.cos(2 * math.pi * TIME)) / 2
@@ -72,7 +82,7 @@ def test_an_arm_circle_needs_a_turn_on_a_round_path() -> None:
     assert rule(circle(turns=0.5)).tolist() == [False]
     assert rule(circle(narrow=0)).tolist() == [False], "up and down"
     assert rule(person()).tolist() == [False]
-    assert kinematics.degrees_turned(circle()).item() == pytest.approx(360, abs=10)
+    assert measures.arm_rotation(circle()).item() == pytest.approx(360, abs=10)
     raised = person()
     as_joints(raised)[0, :, [R_WRIST, L_WRIST], 2] += TIME[:, None]
     assert rule(raised).tolist() == [False], "arms that are raised without a turn"
@@ -127,9 +137,9 @@ def test_half_of_the_windows_begin_elsewhere_and_go_on_as_recorded() -> None:
 def test_poses_are_drawn_of_people_who_stand_and_walk() -> None:
     poses = drawn_poses(500, torch.Generator().manual_seed(0))
     assert poses.shape == (500, 42)
-    assert 0.3 < kinematics.strides(poses).float().mean() < 0.8
-    assert not kinematics.strides(standing_poses(20, torch.Generator().manual_seed(0))).any()
-    assert kinematics.strides(walking_poses(500, torch.Generator().manual_seed(0))).any()
+    assert 0.3 < measures.is_stride(poses).float().mean() < 0.8
+    assert not measures.is_stride(standing_poses(20, torch.Generator().manual_seed(0))).any()
+    assert measures.is_stride(walking_poses(500, torch.Generator().manual_seed(0))).any()
 
 
 def test_smoothing_removes_trembling_and_keeps_the_ends() -> None:

@@ -3,11 +3,10 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.data.features import InitialStates
-from ftl_lightning.domains.mocap import measures
+from ftl_lightning.domains.mocap import DOMAIN, measures
 from ftl_lightning.domains.mocap.judge import Judge
-from ftl_lightning.domains.mocap.measures import MEASURES, POSE, bone_error, distances, diversity, jerk, learned_elsewhere, rise
-from ftl_lightning.domains.mocap.skeleton import FPS, HORIZON, L_WRIST, R_WRIST, as_joints
-from ftl_lightning.domains.mocap.standing import standing_poses
+from ftl_lightning.domains.mocap.measures import POSE, bone_error, distances, diversity, jerk, learned_elsewhere, rise
+from ftl_lightning.domains.mocap.skeleton import FPS, HORIZON, L_WRIST, R_WRIST, as_joints, standing_poses
 from ftl_lightning.services.errors import UserError
 
 
@@ -36,8 +35,8 @@ def test_bones_of_the_start_have_no_error_longer_ones_their_share_and_each_windo
     assert bone_error("walk", states, starts).abs().max() < 1e-6
     assert torch.allclose(bone_error("walk", 1.1 * states, starts), torch.full((3,), 0.1), atol=1e-5)
     assert bone_error("walk", 1.1 * states, None).abs().max() < 1e-6, "without a start, the first frame's lengths are right"
-    for name, measure in MEASURES.items():
-        assert measure("walk", states, None).shape == (3,), name
+    for name, metric in DOMAIN.metrics.items():
+        assert metric.measure("walk", states, None).shape == (3,), name
 
 
 def test_jerk_is_the_size_of_the_third_derivative() -> None:

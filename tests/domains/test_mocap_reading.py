@@ -11,12 +11,10 @@ from numpy.typing import NDArray
 
 from ftl_lightning.domains.mocap.asf_amc import INCH, JOINT_BONES, read_amc, read_asf
 from ftl_lightning.domains.mocap.bvh import METRES, NODES, read_bvh
-from ftl_lightning.domains.mocap.normalise import normalised, z_up
 from ftl_lightning.domains.mocap.prepare import LEFT_OUT, REPORT, prepare
-from ftl_lightning.domains.mocap.recordings import FILE, Recordings, read_folder
-from ftl_lightning.domains.mocap.segments import SEGMENTS, read_segments, shipped_segments
-from ftl_lightning.domains.mocap.skeleton import JOINTS
-from ftl_lightning.domains.mocap.source import Recorded
+from ftl_lightning.domains.mocap.skeleton import JOINTS, normalised, z_up
+from ftl_lightning.domains.mocap.source import FILE, Recorded, Recordings, read_folder
+from ftl_lightning.domains.mocap.tasks import SEGMENTS, read_segments, shipped_segments
 from ftl_lightning.services.errors import UserError
 from tests.conftest import refused, succeed
 from tests.domains.mocap_samples import BONES, amc, asf, database, motion, named_recordings, recordings, swing

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from ftl_lightning.data.container import Demonstrations
-from ftl_lightning.domains.driving.shipped import SHIPPED
+from ftl_lightning.domains.driving.traffic import SHIPPED
 from ftl_lightning.domains.registry import domain_names, load_domain
 from ftl_lightning.domains.vector_film import Shape, VectorFilm, still
 from ftl_lightning.domains.wireframe import Wireframe

@@ -15,9 +15,9 @@ from typing import Any, Self, cast
 import torch
 from torch import Tensor, nn
 
-from ftl_lightning.domains.mocap.actions import CLASSES, LEG_CLASSES, OTHER, STAND, actions, of_legs
 from ftl_lightning.domains.mocap.features import LOWER, UPPER, extremes, signals, summary, turns
 from ftl_lightning.domains.mocap.skeleton import COLUMNS, FPS, HORIZON, as_joints
+from ftl_lightning.domains.mocap.tasks import CLASSES, LEG_CLASSES, OTHER, STAND, actions, of_legs
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.shipped import shipped
 from ftl_lightning.services.tensor_file import file_hash, load_tensors, save_tensors

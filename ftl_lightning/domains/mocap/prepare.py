@@ -8,19 +8,30 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.domains.mocap.asf_amc import Skeleton, read_amc, read_asf
-from ftl_lightning.domains.mocap.bvh import read_bvh
-from ftl_lightning.domains.mocap.normalise import Poses, every, normalised, z_up
-from ftl_lightning.domains.mocap.recordings import FILE, FILES, THANKS, WHERE, Recordings
-from ftl_lightning.domains.mocap.segments import SEGMENTS, read_segments
-from ftl_lightning.domains.mocap.skeleton import HORIZON, JOINTS, RIGID
-from ftl_lightning.domains.mocap.source import glitches, left_out, pieces, too_short
-from ftl_lightning.domains.mocap.tasks import HELD_OUT, TRAINING_CONCEPTS, cleaned
+from ftl_lightning.domains.mocap.bvh import CONVERTED, EXPORTED, converted, read_bvh, read_motion
+from ftl_lightning.domains.mocap.skeleton import COLUMNS, FPS, HORIZON, JOINTS, RIGID, Poses, every, normalised, z_up
+from ftl_lightning.domains.mocap.source import (
+    FILE,
+    FILES,
+    THANKS,
+    WHERE,
+    Recordings,
+    glitches,
+    moving,
+    pieces,
+    training_pieces,
+    unused_reason,
+    validation_trials,
+)
+from ftl_lightning.domains.mocap.tasks import HELD_OUT, SEGMENTS, TRAINING_CONCEPTS, cleaned, read_segments
 from ftl_lightning.services.errors import UserError, short
 from ftl_lightning.services.limits import MOST_TEXT, check_readable
 from ftl_lightning.services.progress import bar
@@ -43,6 +54,10 @@ FLOOR = 0.05
 _TRIAL = re.compile(r"(\d{2,3}_\d{2,3})(?!\d)")
 EXAMPLES = 3
 """Maximum examples printed per reason; the report has all."""
+
+
+SAME_RATE = 0.01
+"""Relative difference of frame rates that is rounding."""
 
 
 class _Dropped(Exception):
@@ -258,3 +273,63 @@ def _index(root: Path) -> dict[str, str]:
     if not descriptions:
         raise UserError(f"{path}: expected lines such as '13_29,description', found none")
     return descriptions
+
+
+def demonstrated(path: Path) -> Demonstrations:
+    """Demonstrations from the motion of a file, without text: each a piece without glitches, as for recordings.
+
+    Args:
+        path: file of ``sample --export``, at any frame rate, or of the conversion.
+
+    Raises:
+        UserError: with the path, for a file that is damaged, of another skeleton, or shorter than a plan.
+    """
+    motion = read_motion(path)
+    if motion.names.issuperset(CONVERTED):
+        joints = converted(motion, None)
+    elif motion.names.issuperset(EXPORTED):
+        joints = motion.places(EXPORTED)
+    else:
+        missing = next(name for name in EXPORTED if name not in motion.names)
+        raise UserError(
+            f"{path}: expected a body as 'sample --export' writes it, or of the MotionBuilder-friendly conversion of the CMU "
+            f"database, found one without {missing!r}"
+        )
+    poses = normalised(z_up(_at_rate(joints, motion.seconds))).positions.astype(np.float32).reshape(-1, len(COLUMNS))
+    parts = pieces(poses)
+    if not parts:
+        raise UserError(
+            f"{path}: expected a motion of {HORIZON} frames or more at {FPS} a second, without jumps, found {len(poses)} frames"
+        )
+    return moving(parts, [""] * len(parts), {"generator": "BVH file", "file": path.name})
+
+
+def _at_rate(joints: NDArray[np.float64], seconds: float) -> NDArray[np.float64]:
+    """Joints ``(frame, 14, 3)`` resampled to :data:`FPS` by linear interpolation."""
+    step = 1 / FPS / seconds
+    whole = max(round(step), 1)
+    step = whole if abs(step - whole) < SAME_RATE * whole else step
+    times = np.arange(0, len(joints) - 1 + 1e-9, step)
+    before = np.minimum(times.astype(int), max(len(joints) - 2, 0))
+    after = np.minimum(before + 1, len(joints) - 1)
+    part = (times - before)[:, None, None]
+    return joints[before] * (1 - part) + joints[after] * part
+
+
+def left_out(every: Recordings) -> dict[int, str]:
+    """Trials without use in pretraining, by number, and reasons."""
+    training = training_pieces(every)
+    validation, used = validation_trials(training), {piece.trial for piece in training}
+    reasons = {}
+    for trial in range(len(every)):
+        short = "" if trial in used else f"no piece of {HORIZON} frames without glitches"
+        held_out = "held out for validation" if trial in validation else ""
+        if reason := unused_reason(every, trial) or short or held_out:
+            reasons[trial] = reason
+    return reasons
+
+
+def too_short(states: NDArray[np.float32]) -> int:
+    """Number of frames of a trial ``(frame, 42)`` in pieces shorter than a window."""
+    ends = pairwise((0, *glitches(states), len(states)))
+    return sum(stop - start for start, stop in ends if stop - start < HORIZON)

@@ -4,10 +4,15 @@ Training concepts are descriptions of trials by the database (``cmu-mocap-index.
 as :func:`cleaned`. Pretraining excludes trials of other concepts.
 """
 
+import csv
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
 
 from ftl_lightning.domains.tasks import EvaluationTask, Suite
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.limits import read_text
 
 HELD_OUT = ("13_29", "13_30", "13_31", "14_14", "14_20", "79_01", "80_71", "126_03", "126_04", "126_05")
 """Trials excluded from pretraining as a whole, since they show a new concept."""
@@ -97,7 +102,7 @@ ACTION_OF: Mapping[str, str | None] = {
     "wash windows": None,
     "zombie walk": "walk",
 }
-"""Training concepts and their actions (:mod:`ftl_lightning.domains.mocap.actions`); ``None`` for other actions, or several in
+"""Training concepts and their actions (:mod:`ftl_lightning.domains.mocap.tasks`); ``None`` for other actions, or several in
 sequence. Dances are separate actions: each kind was danced by a single subject."""
 TRAINING_CONCEPTS = tuple(ACTION_OF)
 PAPER_CONCEPTS = ("jumping jacks",)
@@ -184,3 +189,136 @@ SUITES = {
 
 ``'database'`` needs the trials of :data:`DATABASE_CONCEPTS` in the user's copy. ``'whole'`` is the part of ``'composition'`` for
 methods that cannot compose by parts of the body."""
+
+
+OTHER = "other"
+"""No action: motions of a single person, standing people, and windows without motion (a frozen frame, trembling)."""
+
+_NAMES = (
+    "walk",
+    "run",
+    "jump",
+    "kick",
+    "punch",
+    "signals",
+    "jumping jacks",
+    "twist",
+    "knee raise",
+    "arm circle",
+    "squat",
+    "toe touch",
+    "ballet",
+    "basketball",
+    "cartwheel",
+    "charleston",
+    "climb",
+    "lambada",
+    "pose",
+    "swordplay",
+)
+CLASSES = (*_NAMES, OTHER)
+"""Classes of a judge."""
+
+TESTED = CLASSES[: CLASSES.index("toe touch") + 1]
+"""Classes of two subjects or more, on which a judge can be tested with new people."""
+
+_LABELS = {"jog": "run", "leg kick": "kick", "toe touch one hand": "toe touch", "toe touch two hands": "toe touch"}
+"""Labels of segments that are no training concepts."""
+_CLASS_OF = {name: name for name in _NAMES} | _LABELS | {text: name for text, name in ACTION_OF.items() if name is not None}
+
+STAND = "stand"
+"""Class of the legs in actions of arms and trunk."""
+STANDING = ("punch", "signals", "twist", "arm circle", "toe touch", "swordplay")
+"""Actions of arms and trunk."""
+STEPPING = ("walk", "run", "kick", "knee raise", "squat", "basketball")
+"""Actions of the legs, independent of the arms."""
+REVERSIBLE = ("jumping jacks", "twist", "knee raise", "arm circle", "squat", "toe touch")
+"""Periodic actions, invariant to time reversal."""
+LEG_CLASSES = (*(name for name in CLASSES if name not in STANDING), STAND)
+"""Classes of a judge of the legs."""
+
+
+def action(text: str) -> str | None:
+    """Class of a description; ``None`` for no class, or several in sequence."""
+    return _CLASS_OF.get(cleaned(text))
+
+
+def actions(goal: str) -> tuple[str, ...]:
+    """Classes of a goal; for two joined actions, arms and trunk first, then the legs.
+
+    Returns:
+        An empty tuple if the goal cannot be judged.
+    """
+    classes = [action(part) for part in goal_parts(goal)]
+    return tuple(name for name in classes if name is not None) if None not in classes and len(classes) <= 2 else ()
+
+
+def judged(goal: str) -> bool:
+    """Whether a goal can be judged."""
+    return bool(actions(goal))
+
+
+def of_legs(name: str) -> str:
+    """Class of the legs in an action."""
+    return STAND if name in STANDING else name
+
+
+SEGMENTS = "segments.csv"
+HEADER = ("trial_id", "label", "start30", "stop30")
+
+
+@dataclass(frozen=True)
+class Segment:
+    """Part of a trial with a single action.
+
+    Attributes:
+        trial_id: such as ``13_29``.
+        label: the action.
+        start, stop: frames at 30 per second, the last excluded; ``stop`` is ``None`` for the end of the trial.
+    """
+
+    trial_id: str
+    label: str
+    start: int
+    stop: int | None
+
+
+WHOLE_TRIALS = tuple(
+    Segment(trial, label, 0, None)
+    for label, trials in (("chop wood", ("79_01", "80_71")), ("breaststroke", ("126_03", "126_04", "126_05")))
+    for trial in trials
+)
+"""Trials that show a new action from start to end."""
+
+
+def shipped_segments() -> tuple[Segment, ...]:
+    """Segments of the package."""
+    return read_segments(Path(__file__).parent / SEGMENTS)
+
+
+def read_segments(path: Path) -> tuple[Segment, ...]:
+    """Segments of a file with the columns ``trial_id,label,start30,stop30``, and :data:`WHOLE_TRIALS`.
+
+    Raises:
+        UserError: with path and line.
+    """
+    try:
+        lines = list(csv.reader(read_text(path, "table of segments").splitlines()))
+    except csv.Error as error:
+        raise UserError(f"{path}: expected a table of segments (CSV), found a file that cannot be read ({error})") from error
+    if not lines or tuple(lines[0]) != HEADER:
+        raise UserError(f"{path}: line 1: expected {','.join(HEADER)}, found {','.join(lines[0]) if lines else 'nothing'}")
+    segments = []
+    for number, fields in enumerate(lines[1:], start=2):
+        if not fields:
+            continue
+        if (
+            len(fields) != len(HEADER)
+            or not all(field.strip().isdigit() for field in fields[2:])
+            or int(fields[2]) >= int(fields[3])
+        ):
+            line = ",".join(fields)
+            raise UserError(f"{path}: line {number}: expected a trial, a label, a first frame and a later one, found {line!r}")
+        segments.append(Segment(fields[0].strip(), fields[1].strip(), int(fields[2]), int(fields[3])))
+    labels = {segment.label for segment in segments}
+    return (*segments, *(segment for segment in WHOLE_TRIALS if segment.label not in labels))

@@ -1,6 +1,6 @@
 """Gymnasium environment of a Panda arm at a table, simulated by pybullet."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import gymnasium
@@ -8,22 +8,43 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ftl_lightning.domains.physics import Simulator, pybullet
-from ftl_lightning.domains.tabletop.interface import ACTION, FEATURES, HERTZ, IMAGE, MAX_STEPS, OPEN, POSE, THRESHOLD
+from ftl_lightning.domains.tabletop.interface import (
+    ACTION,
+    BESIDE,
+    FEATURES,
+    FRONT,
+    HERTZ,
+    IMAGE,
+    MAX_STEPS,
+    OPEN,
+    OVERHEAD,
+    POSE,
+    PUSH,
+    PUSH_ON_BOOK,
+    PUSHES,
+    THRESHOLD,
+    TO_BOOK,
+    check_task,
+)
 from ftl_lightning.domains.tabletop.scenes import (
     BOOK,
     CIRCLE,
+    COLUMNS,
     HAND,
     HEIGHT,
     OBJECTS,
     SCENE,
+    TARGET,
     TRIANGLE,
+    WHITE,
     check,
     draw_scene,
     gap,
     outline,
+    support,
+    within,
 )
-from ftl_lightning.domains.tabletop.tasks import PUSH, check_task
-from ftl_lightning.domains.tabletop.world import ARM, FASTEST, FINGERS, FRONT, OVERHEAD, REST, TIP, Bodies, build, downward, turned
+from ftl_lightning.domains.tabletop.world import ARM, FASTEST, FINGERS, REST, TIP, Bodies, build, downward, turned
 from ftl_lightning.services.errors import UserError
 
 TARGETS, SUBSTEPS = 3, 8
@@ -280,3 +301,50 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
 def touching(shape: NDArray[np.float64], circle: NDArray[np.float64]) -> bool:
     """Whether a circle with this centre touches an outline, seen from above."""
     return gap(outline(CIRCLE, float(circle[0]), float(circle[1]), 0.0), shape) <= TOUCH
+
+
+LEVEL = 0.008
+"""Tolerance in metres of the circle's height on a surface."""
+NEAR = 0.15
+"""Maximum centre distance in metres between the circle and the object beside it."""
+
+
+def judged(task: str, scene: NDArray[np.float32], told: Mapping[str, Any]) -> bool:
+    """Whether a task is done.
+
+    - Pushes to the triangle: circle and triangle touch (see the environment's ``TOUCH``); both are still on their initial surface.
+    - Pushes to another object: the circle has touched only this object, and lies on the table.
+    - Picks to the book and to the white surface: the circle was lifted and released; it lies on the surface, its centre over it.
+    - Picks beside an object: the circle was lifted and released; it lies on the table, its centre within :data:`NEAR` of it.
+
+    Args:
+        task: known task.
+        scene: ``(24,)``, initial scene.
+        told: info of the environment's last step; empty if there was none.
+    """
+    check_task(task)
+    if not told:
+        return False
+    circle = told["circle"]
+    if task in PUSHES and TARGET[task] != TRIANGLE:
+        return set(told["touches"]) == {TARGET[task]} and _lies(circle, 0.0)
+    if task in PUSHES:
+        surface = HEIGHT[BOOK] if task == PUSH_ON_BOOK else support(scene, CIRCLE)
+        both = (circle, told["triangle"])
+        return bool(told["touched"]) and all(place is not None and _lies(place, surface) for place in both)
+    if not (told["lifted"] and told["released"]):
+        return False
+    if task in BESIDE:
+        thing = told["triangle"] if TARGET[task] == TRIANGLE else scene[COLUMNS[TARGET[task]]][1:4]
+        return _lies(circle, 0.0) and float(np.linalg.norm(circle[:2] - thing[:2])) <= NEAR
+    name = BOOK if task == TO_BOOK else WHITE
+    x, y, yaw = map(float, scene[COLUMNS[name]][1:])
+    moved = told["book place"] if task == TO_BOOK else None
+    if moved is not None:
+        x, y = float(moved[0]), float(moved[1])
+    return _lies(circle, HEIGHT[name]) and within(circle[None, :2], outline(name, x, y, yaw))
+
+
+def _lies(place: NDArray[np.float64], surface: float) -> bool:
+    """Whether the centre of circle or triangle has the height of flat contact with a surface."""
+    return abs(float(place[2]) - surface - HEIGHT[CIRCLE] / 2) <= LEVEL

@@ -11,9 +11,9 @@ from torch import Tensor
 
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.rollout import Rollout
-from ftl_lightning.domains.tabletop.interface import HERTZ, POSE, THRESHOLD, check_simulator
+from ftl_lightning.domains.tabletop.interface import FRONT, HERTZ, POSE, THRESHOLD, check_simulator
 from ftl_lightning.domains.tabletop.scenes import BOOK, CIRCLE, COLUMNS, HEIGHT, OBJECTS, SIGHT, WHITE, outline, outlines, support
-from ftl_lightning.domains.tabletop.world import ARM, COLOUR, FINGERS, FRONT, TABLE_COLOUR
+from ftl_lightning.domains.tabletop.world import ARM, COLOUR, FINGERS, TABLE_COLOUR
 from ftl_lightning.domains.vector_film import Shape, VectorFilm, some, still
 from ftl_lightning.services.escape import figure_text
 

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ftl_lightning.domains.tabletop.tasks import (
+from ftl_lightning.domains.tabletop.interface import (
     AROUND_BOWL,
     BESIDE,
     BESIDE_BOWL,
@@ -329,3 +329,39 @@ def scenes(task: str, count: int, seed: int) -> Tensor:
     check_task(task)
     drawn = [draw_scene(task, np.random.default_rng([seed, task_key(task), number])) for number in range(count)]
     return torch.from_numpy(np.stack(drawn))
+
+
+SURFACES = (BOOK, WHITE)
+"""Objects that can carry the triangle."""
+RAISED = 0.5
+"""Probability of a triangle on a surface, if one is visible."""
+
+Pose = tuple[float, float, float]
+"""x, y and yaw."""
+HIDDEN: Pose = (-5.0, 0.0, 0.0)
+"""Position of objects that an image does not show."""
+
+
+def free_pose(rng: np.random.Generator, name: str, taken: Mapping[str, Points]) -> tuple[float, Pose]:
+    """Draw a height and a pose without overlap; hidden if none fits."""
+    below = [surface for surface in SURFACES if surface in taken] if name == TRIANGLE else []
+    if below and rng.uniform() < RAISED:
+        under = below[rng.integers(len(below))]
+        low, high = taken[under].min(axis=0), taken[under].max(axis=0)
+        for _ in range(TRIES):
+            x, y = map(float, rng.uniform(low, high))
+            pose = (x, y, random_yaw(rng, name))
+            points = outline(name, *pose)
+            if within(points, taken[under]) and _apart(points, {key: shape for key, shape in taken.items() if key != under}):
+                return HEIGHT[under], pose
+    low, high = np.transpose(SIGHT)
+    for _ in range(TRIES):
+        pose = (*anywhere(rng), random_yaw(rng, name))
+        points = outline(name, *pose)
+        if (points > low).all() and (points < high).all() and _apart(points, taken):
+            return 0.0, pose
+    return 0.0, HIDDEN
+
+
+def _apart(points: Points, taken: Mapping[str, Points]) -> bool:
+    return all(gap(points, shape) >= APART for shape in taken.values())
