@@ -20,8 +20,8 @@ from torch import Tensor
 
 from ftl_lightning.domains.mocap.domain import begun_elsewhere
 from ftl_lightning.domains.mocap.measures import SETTLED, distances, diversity, learned_elsewhere, multimodality
-from ftl_lightning.domains.mocap.skeleton import HORIZON
-from ftl_lightning.domains.mocap.source import POSE, Recorded, at_rest, pieces
+from ftl_lightning.domains.mocap.skeleton import HORIZON, POSE
+from ftl_lightning.domains.mocap.source import Recorded, at_rest, pieces
 from ftl_lightning.domains.mocap.tasks import DEMONSTRATORS, TESTED, action
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import Concept

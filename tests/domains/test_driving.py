@@ -201,7 +201,7 @@ def test_an_episode_repeats_and_starts_where_its_numbers_say() -> None:
     assert seen[SCENARIO].tolist() == [NAMES.index("roundabout")]
     other.reset(options={"scene": given})
     assert env.np_random.random() == other.np_random.random()  # draws among equal decisions
-    with pytest.raises(UserError, match="expected the start of 'roundabout'"):
+    with pytest.raises(UserError, match="expected the initial state of 'roundabout'"):
         env.reset(options={"scene": np.concatenate((first[2], given[OBSERVED:]))})
 
 

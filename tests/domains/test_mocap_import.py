@@ -92,7 +92,7 @@ def test_the_conversion_of_the_database_is_imported_in_metres(tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
-        (lambda text: text.replace("LeftForeArm", "Lower_Arm_L"), "found one without 'LeftForeArm'"),
+        (lambda text: text.replace("LeftForeArm", "Lower_Arm_L"), "found a skeleton without 'LeftForeArm'"),
         (lambda text: text[:-40], "found a damaged one"),
         (lambda text: text.replace("MOTION", "MOTIONS OF"), "found a damaged one"),
         (lambda text: text.partition("MOTION")[0], "no line MOTION"),

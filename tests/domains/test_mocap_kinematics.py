@@ -13,6 +13,7 @@ from ftl_lightning.domains.mocap.skeleton import (
     L_ANKLE,
     L_KNEE,
     L_WRIST,
+    POSE,
     R_ANKLE,
     R_KNEE,
     R_WRIST,
@@ -21,7 +22,6 @@ from ftl_lightning.domains.mocap.skeleton import (
     standing_poses,
     walking_poses,
 )
-from ftl_lightning.domains.mocap.source import POSE
 
 TIME = torch.linspace(0, 1, HORIZON)
 PHASE = (1 - torch.cos(2 * math.pi * TIME)) / 2

@@ -5,8 +5,8 @@ from torch import Tensor
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.mocap import DOMAIN, measures
 from ftl_lightning.domains.mocap.judge import Judge
-from ftl_lightning.domains.mocap.measures import POSE, bone_error, distances, diversity, jerk, learned_elsewhere, rise
-from ftl_lightning.domains.mocap.skeleton import FPS, HORIZON, L_WRIST, R_WRIST, as_joints, standing_poses
+from ftl_lightning.domains.mocap.measures import bone_error, distances, diversity, jerk, learned_elsewhere, rise
+from ftl_lightning.domains.mocap.skeleton import FPS, HORIZON, L_WRIST, POSE, R_WRIST, as_joints, standing_poses
 from ftl_lightning.services.errors import UserError
 
 

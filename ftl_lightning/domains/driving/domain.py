@@ -192,16 +192,8 @@ class Expert:
         from ftl_lightning.domains.driving.expert import BLIND, SEARCH, demonstrations
         from ftl_lightning.domains.driving.scenarios import scenario
 
-        settings = {
-            "domain": NAME,
-            "task": task,
-            "count": count,
-            "seed": seed,
-            "config": scenario(task).config,
-            "search": SEARCH[task],
-            "beyond": HORIZON,
-            **({"blind": asdict(BLIND)} if self.blind else {}),
-        }
+        settings = {"domain": NAME, "task": task, "count": count, "seed": seed, "config": scenario(task).config}
+        settings |= {"search": SEARCH[task], "beyond": HORIZON, **({"blind": asdict(BLIND)} if self.blind else {})}
         return cached(settings, count, lambda progress: demonstrations(task, count, seed, workers, progress, self.blind))
 
     def starts(self, task: str, count: int, seed: int) -> InitialStates:

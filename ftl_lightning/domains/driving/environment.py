@@ -29,7 +29,6 @@ from ftl_lightning.services.errors import require
 
 DRIVE = 4
 """Columns of a drive."""
-
 Seen = dict[str, NDArray[np.float32]]
 """Observed features by name."""
 
@@ -70,11 +69,7 @@ class DrivingEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         self._length = 0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Seen, dict[str, Any]]:
-        """Reset to an initial state.
-
-        Args:
-            seed: seed of the initial state if no scene is given.
-            options: ``scene``, 37 numbers; or ``task``, a scenario (default 'roundabout').
+        """Reset to the initial state of ``options['scene']``, 37 numbers, or of a random seed in the scenario ``options['task']``.
 
         Raises:
             UserError: for a scene that its scenario and seed do not reproduce.
@@ -104,11 +99,7 @@ class DrivingEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         return {TRAFFIC: observe(self.simulation).reshape(OBSERVED).astype(np.float32), SCENARIO: number}
 
     def step(self, action: NDArray[np.float32]) -> tuple[Seen, float, bool, bool, dict[str, Any]]:
-        """Take a decision and simulate until the next.
-
-        Raises:
-            UserError: for an action of the wrong size or with numbers that are not finite.
-        """
+        """Take a decision and simulate until the next."""
         wish = np.asarray(action, dtype=np.float64)
         numbers = wish.shape in ((STATE,), (DRIVE,), (1,)) and np.isfinite(wish).all()
         require(numbers, "driving action", f"{STATE} finite numbers, {DRIVE} or 1", wish.tolist())
@@ -120,10 +111,7 @@ class DrivingEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         return self.observation(), reward, ended, self._length >= MAX_STEPS, info
 
     def decide(self, wish: NDArray[np.float64]) -> int:
-        """Return the decision of minimum risk nearest to an action (see the class); brake if all crash.
-
-        The simulation is left unchanged; random numbers for ties are consumed.
-        """
+        """Return the decision of minimum risk nearest to an action, see the class; the simulation is left unchanged."""
         now = observe(self.simulation)[0].astype(np.float64)
         self._beliefs.look()
         rng = np.random.default_rng([self._seed, self._length])

@@ -25,6 +25,7 @@ from ftl_lightning.domains.driving.traffic import (
     FEATURES_SEEN,
     HORIZON,
     NAME,
+    NAMES,
     OBSERVED,
     SCENARIO,
     STATE,
@@ -61,15 +62,11 @@ class Search:
     sight: float = math.inf
 
 
-SEARCH = {
+SEARCH = dict.fromkeys(NAMES, Search(75, 0.9)) | {
     "highway": Search(75, 0.7, sight=200),
     "exit": Search(200, 0.85, frequency=5, sight=120),
     "merge": Search(75, 0.7, frequency=5),
     "intersection": Search(75, 0.9, hold=2),
-    "roundabout": Search(75, 0.9),
-    "roundabout third exit": Search(75, 0.9),
-    "roundabout of three lanes": Search(75, 0.9),
-    "roundabout of one lane": Search(75, 0.9),
 }
 
 IDLE = 1

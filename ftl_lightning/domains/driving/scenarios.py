@@ -139,6 +139,14 @@ def _on(*roads: tuple[str, str]) -> Callable[[AbstractEnv], bool]:
 
 EXITS = ("exr", "sxr", "nxr")
 """Exits of the roundabout for other vehicles."""
+
+
+def _other_roundabout(radius: int, lanes: int, vehicles: int) -> Scenario:
+    config = {"duration": 12, "roundabout_radius": radius, "roundabout_lanes": lanes, "vehicles_count": vehicles}
+    return Scenario(OtherRoundabout, config, _SECOND_EXIT, destinations=(*EXITS, "wxr"))
+
+
+_SECOND_EXIT = _on(("nx", "nxs"), ("nxs", "nxr"))
 SCENARIOS = {
     "highway": Scenario(Highway, {"duration": 10}, lambda env: bool(env.time >= env.config["duration"])),
     "exit": Scenario(
@@ -166,23 +174,13 @@ SCENARIOS = {
     "roundabout": Scenario(
         Roundabout,
         {"duration": 8},
-        _on(("nx", "nxs"), ("nxs", "nxr")),
+        _SECOND_EXIT,
         passed=lambda env: bool(env.vehicle.position[1] < -20),
         destinations=EXITS,
     ),
     "roundabout third exit": Scenario(ThirdExit, {"duration": 10}, _on(("wx", "wxs"), ("wxs", "wxr")), destinations=EXITS),
-    "roundabout of three lanes": Scenario(
-        OtherRoundabout,
-        {"duration": 12, "roundabout_radius": 28, "roundabout_lanes": 3, "vehicles_count": 7},
-        _on(("nx", "nxs"), ("nxs", "nxr")),
-        destinations=(*EXITS, "wxr"),
-    ),
-    "roundabout of one lane": Scenario(
-        OtherRoundabout,
-        {"duration": 12, "roundabout_radius": 16, "roundabout_lanes": 1, "vehicles_count": 4},
-        _on(("nx", "nxs"), ("nxs", "nxr")),
-        destinations=(*EXITS, "wxr"),
-    ),
+    "roundabout of three lanes": _other_roundabout(radius=28, lanes=3, vehicles=7),
+    "roundabout of one lane": _other_roundabout(radius=16, lanes=1, vehicles=4),
 }
 
 

@@ -43,18 +43,9 @@ SEEDS = 2**24
 BELIEF, SIMULATION, STEP = "belief", "simulation", "step"
 """Names of the planner's vetoes, see :mod:`ftl_lightning.domains.driving.foresight`."""
 
-DECISIONS = {
-    "highway": 1,
-    "exit": 1,
-    "merge": 1,
-    "intersection": 2,
-    "roundabout": 1,
-    "roundabout third exit": 1,
-    "roundabout of three lanes": 1,
-    "roundabout of one lane": 1,
-}
-"""Decisions per second by scenario."""
-NAMES = tuple(DECISIONS)
+TRAINING_CONCEPTS = ("highway", "exit", "merge", "intersection")
+OTHER_ROUNDABOUTS = ("roundabout of three lanes", "roundabout of one lane")
+NAMES = (*TRAINING_CONCEPTS, "roundabout", "roundabout third exit", *OTHER_ROUNDABOUTS)
 """Scenario names; scenes contain the index."""
 
 
@@ -65,13 +56,13 @@ def check_simulator() -> None:
 
 def check_scenario(name: str) -> str:
     """Return the name of a scenario; raise a ``UserError`` for any other."""
-    require(name in DECISIONS, "driving task", f"one of {', '.join(NAMES)}", repr(name))
+    require(name in NAMES, "driving task", f"one of {', '.join(NAMES)}", repr(name))
     return name
 
 
 def decision_seconds(name: str) -> float:
     """Seconds between decisions of a scenario; raises a ``UserError`` for an unknown name."""
-    return 1 / DECISIONS[check_scenario(name)]
+    return 0.5 if check_scenario(name) == "intersection" else 1.0
 
 
 def episode_seed(seed: int, number: int) -> int:
@@ -104,23 +95,17 @@ def origin(given: NDArray[np.float32]) -> tuple[str, int]:
     return NAMES[int(number)], int(seed)
 
 
-TRAINING_CONCEPTS = ("highway", "exit", "merge", "intersection")
 NEW = "new initial state"
-
-TRAINING = training_suite(TRAINING_CONCEPTS)
-PAPER = Suite((EvaluationTask(NEW, "roundabout", learned=("roundabout",)),))
-VALIDATION = Suite((EvaluationTask(NEW, "roundabout third exit", learned=("roundabout third exit",)),))
-"""Another route through the same roundabout."""
-
-OTHER = Suite(
-    tuple(
-        EvaluationTask("other roundabout", name, learned=("roundabout",))
-        for name in ("roundabout of three lanes", "roundabout of one lane")
-    )
-)
-"""Roundabouts of other sizes, for the concept learned in the paper's roundabout; not used for tuning."""
-
-SUITES = {"training": TRAINING, "paper": PAPER, "validation": VALIDATION, "other roundabouts": OTHER}
+SUITES = {
+    "training": training_suite(TRAINING_CONCEPTS),
+    "paper": Suite((EvaluationTask(NEW, "roundabout", learned=("roundabout",)),)),
+    "validation": Suite((EvaluationTask(NEW, "roundabout third exit", learned=("roundabout third exit",)),)),
+    "other roundabouts": Suite(
+        tuple(EvaluationTask("other roundabout", name, learned=("roundabout",)) for name in OTHER_ROUNDABOUTS)
+    ),
+}
+"""``validation`` is another route through the same roundabout. ``other roundabouts`` have other sizes, for the concept learned in
+the paper's roundabout; they are not used for tuning."""
 
 
 SHIPPED = Path(__file__).parent / "demonstrations"
@@ -132,12 +117,7 @@ HELD_OUT = 10
 def training_set(name: Split, count: int, folder: Path | None = None) -> Demonstrations:
     """The first ``count`` shipped episodes per training scenario; for ``'validation'``, held-out episodes.
 
-    They are the same for every seed, as generation takes half an hour.
-
-    Args:
-        name: name of the split.
-        count: number per scenario.
-        folder: folder of other episodes, a file per scenario as written by ``generate``.
+    ``folder`` has other episodes, a file per scenario as written by ``generate``.
 
     Raises:
         UserError: if there are fewer, or no file.

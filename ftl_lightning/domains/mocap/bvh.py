@@ -1,4 +1,4 @@
-"""BVH files: skeleton, rotations per frame, and forward kinematics.
+"""BVH files: reading by forward kinematics, and export, readable by Blender and other animation software.
 
 A joint may also have a position per frame, which replaces its offset, as in Blender.
 """
@@ -16,7 +16,7 @@ from torch import Tensor
 from ftl_lightning.domains.mocap import skeleton
 from ftl_lightning.domains.mocap.asf_amc import INCH, THORAX, Skeleton
 from ftl_lightning.domains.mocap.skeleton import FPS, as_joints, standing_poses
-from ftl_lightning.services.errors import UserError, short
+from ftl_lightning.services.errors import UserError, require, short
 from ftl_lightning.services.limits import read_text
 
 Numbers = NDArray[np.float64]
@@ -110,59 +110,53 @@ def read_motion(path: Path) -> Motion:
     """
     text = read_text(path, "BVH")
     try:
-        skeleton, mark, rest = text.partition("MOTION")
-        if not mark:
-            raise ValueError("no line MOTION")
-        nodes = tuple(_nodes(iter(skeleton.split())))
+        hierarchy, mark, rest = text.partition("MOTION")
+        _check(mark, "no line MOTION")
+        nodes = tuple(_nodes(iter(hierarchy.split())))
         words = rest.split(maxsplit=5)
-        if len(words) < 5 or [word.lower() for word in (words[0], words[2], words[3])] != ["frames:", "frame", "time:"]:
-            raise ValueError("no lines 'Frames: N' and 'Frame Time: S' after MOTION")
+        keys = [word.lower() for word in (*words[:1], *words[2:4])]
+        _check(len(words) > 4 and keys == ["frames:", "frame", "time:"], "no lines 'Frames: N' and 'Frame Time: S' after MOTION")
         count, seconds = int(words[1]), float(words[4])
         values = np.array(words[5].split() if len(words) > 5 else [], dtype=np.float64)
         channels = sum(len(node.channels) for node in nodes)
-        if count < 1 or not 0 < seconds < np.inf:
-            raise ValueError(f"{count} frames of {seconds:g} s")
-        if len(values) != count * channels:
-            raise ValueError(f"{len(values)} numbers for {count} frames of {channels}")
-        if not (np.isfinite(values).all() and all(np.isfinite(node.offset).all() for node in nodes)):
-            raise ValueError("numbers that are not finite")
+        _check(count >= 1 and 0 < seconds < np.inf, f"{count} frames of {seconds:g} s")
+        _check(len(values) == count * channels, f"{len(values)} numbers for {count} frames of {channels}")
+        finite = np.isfinite(values).all() and all(np.isfinite(node.offset).all() for node in nodes)
+        _check(finite, "numbers that are not finite")
     except ValueError as error:
         raise UserError(f"{path}: expected a BVH file, found a damaged one ({short(str(error), 100)})") from error
     return Motion(nodes, values.reshape(count, channels), seconds)
 
 
-def _nodes(words: Iterator[str]) -> Iterable[Node]:
-    """Nodes from the words of a file's hierarchy.
+def _check(condition: object, damage: str) -> None:
+    if not condition:
+        raise ValueError(damage)
 
-    Raises:
-        ValueError: for a damaged hierarchy.
-    """
-    if next(words, "") != "HIERARCHY":
-        raise ValueError("no line HIERARCHY")
+
+def _nodes(words: Iterator[str]) -> Iterable[Node]:
+    """Nodes from the words of a file's hierarchy; a damaged hierarchy raises a ``ValueError``."""
+    _check(next(words, "") == "HIERARCHY", "no line HIERARCHY")
     nodes: list[Node] = []
     path: list[int] = []  # from the root to the open node
     for word in words:
         if word == "}" and path:
             path.pop()
             continue
-        if word not in ("ROOT", "JOINT", "End") or (word == "ROOT") == bool(nodes) or bool(nodes) != bool(path):
-            raise ValueError(f"{word!r} where a joint was expected")
+        joint = word in ("ROOT", "JOINT", "End") and (word == "ROOT") != bool(nodes) and bool(nodes) == bool(path)
+        _check(joint, f"{word!r} where a joint was expected")
         name = next(words, "")
         parent = path[-1] if path else -1
-        if [next(words, ""), next(words, "")] != ["{", "OFFSET"]:
-            raise ValueError(f"no offset of {name!r}")
+        _check([next(words, ""), next(words, "")] == ["{", "OFFSET"], f"no offset of {name!r}")
         offset = np.array([float(next(words, "")) for _ in range(3)])
         channels: tuple[str, ...] = ()
         if word != "End":
-            if next(words, "") != "CHANNELS":
-                raise ValueError(f"no channels of {name!r}")
+            _check(next(words, "") == "CHANNELS", f"no channels of {name!r}")
             channels = tuple(next(words, "") for _ in range(min(int(next(words, "")), 7)))
-            if unknown := set(channels) - {*_POSITIONS, *_ROTATIONS}:
-                raise ValueError(f"channel {min(unknown)!r} of {name!r}")
+            unknown = set(channels) - {*_POSITIONS, *_ROTATIONS}
+            _check(not unknown, f"channel {min(unknown, default='')!r} of {name!r}")
         path.append(len(nodes))
         nodes.append(Node(f"{END}{nodes[parent].name}" if word == "End" else name, parent, offset, channels))
-    if path or not nodes:
-        raise ValueError("brackets that do not close")
+    _check(nodes and not path, "brackets that do not close")
     return nodes
 
 
@@ -179,25 +173,28 @@ CONVERTED = (*NODES, *_AFTER_THORAX, _BELOW)
 
 
 def read_bvh(path: Path, skeleton: Skeleton | None) -> tuple[NDArray[np.float64], int]:
-    """Joint positions ``(frame, 14, 3)`` in metres, y up, and frames per second.
+    """Joint positions ``(frame, 14, 3)`` in metres, y up, and frames per second, of a file of the conversion.
 
     Args:
         path: the file.
         skeleton: skeleton of the subject, if available.
 
     Raises:
-        UserError: with the path, for a file that is damaged or of another conversion.
+        UserError: with the path, for a file that is damaged or not of the conversion.
     """
     motion = read_motion(path)
-    if missing := [name for name in CONVERTED if name not in motion.names]:
-        raise UserError(
-            f"{path}: expected the MotionBuilder-friendly conversion of the database, found a skeleton without {missing[0]!r}"
-        )
+    for name in CONVERTED:
+        expected = "the MotionBuilder-friendly conversion of the database"
+        require(name in motion.names, str(path), expected, f"a skeleton without {name!r}")
     return converted(motion, skeleton), round(1 / motion.seconds)
 
 
 def converted(motion: Motion, skeleton: Skeleton | None) -> NDArray[np.float64]:
-    """Joints ``(frame, 14, 3)`` of the conversion, without the first frame."""
+    """Joints ``(frame, 14, 3)`` in metres of B. Hahne's MotionBuilder-friendly conversion of the database (cgspeed).
+
+    The conversion omits the thorax: neck and collars start at its base. It is restored from the subject's ASF, if available, else
+    replaced by the bone below it. The first frame, a T-pose, is skipped.
+    """
     offsets = {node.name: node.offset for node in motion.nodes}
     thorax = offsets[_BELOW] if skeleton is None else skeleton.bones[THORAX].reach
     put_back = {name: np.asarray(thorax, dtype=np.float64) for name in _AFTER_THORAX if not np.any(offsets[name])}
@@ -213,7 +210,7 @@ SHORTEST = 1e-6
 
 
 class Joint(NamedTuple):
-    """Joint of the file.
+    """Joint of an exported file.
 
     Attributes:
         name: name in the MotionBuilder-friendly conversion.
@@ -258,8 +255,10 @@ _PLACE, _TURN = "Xposition Yposition Zposition", "Zrotation Yrotation Xrotation"
 def bvh(states: Tensor) -> str:
     """Convert a motion to the text of a BVH file.
 
-    Bones have the lengths of the first frame and the rest directions of a standing pose. Rotations between frames are minimal, so
-    that no arm spins about its axis, not even overhead.
+    In the file y is up, the person faces +z, +x is the person's left, and the unit is the metre. The root is the middle of the
+    hips. Joints rotate; joints without rigid bone to the parent (shoulders, neck, head) also have a position per frame, as in
+    Blender. Bones have the lengths of the first frame and the rest directions of a standing pose. Rotations between frames are
+    minimal, so that no arm spins about its axis.
 
     Args:
         states: ``(frame, 42)`` in metres.
@@ -267,8 +266,7 @@ def bvh(states: Tensor) -> str:
     Raises:
         UserError: for numbers that are not finite.
     """
-    if not states.isfinite().all():
-        raise UserError("export: expected motion of finite numbers, found others; draw it anew with another --seed")
+    require(states.isfinite().all(), "export", "motion of finite numbers", "others; draw it anew with another --seed")
     places = _places(states)
     (rest,) = _places(standing_poses(1, torch.Generator().manual_seed(0)))
     turns: list[Numbers] = []  # of each joint in the file's axes, (frame, 3, 3)

@@ -38,14 +38,11 @@ def with_rigid_bones(states: Tensor, observed: Observed) -> Tensor:
     """Scale rigid bones to their lengths in the initial pose.
 
     From the origin, the middle of the hips, outwards, each joint moves along its bone with all its descendants. Directions of bones
-    are constant.
+    are constant; recordings are unchanged.
 
     Args:
         states: ``(sample, horizon, 42)`` in metres.
         observed: with :data:`POSE`, ``(sample, 42)``.
-
-    Returns:
-        ``(sample, horizon, 42)``; recordings are unchanged.
     """
     joints, start = as_joints(states), as_joints(observed[POSE])
     moved = list(joints.unbind(dim=-2))
@@ -64,14 +61,7 @@ def smoothed(states: Tensor, observed: Observed) -> Tensor:
     """Apply a running mean of three frames twice, then rigid bones; first and last frame are constant.
 
     Network errors are independent between frames, motion is not: the weighted mean of five frames keeps a quarter of their
-    variance.
-
-    Args:
-        states: ``(sample, horizon, 42)`` in metres.
-        observed: with :data:`POSE`, ``(sample, 42)``.
-
-    Returns:
-        ``(sample, horizon, 42)``.
+    variance. Arguments as of :func:`with_rigid_bones`.
     """
     for _ in range(2):
         inside = (states[:, :-2] + states[:, 1:-1] + states[:, 2:]) / 3

@@ -101,10 +101,7 @@ def calm(states: Tensor) -> Tensor:
 
 
 def synchronous(states: Tensor) -> Tensor:
-    """Whether feet open and close in time with the hands: ``(sample,)`` of bool.
-
-    Most people open their feet as the hands rise; some, as they sink. Judged from :data:`SETTLED` on.
-    """
+    """Whether feet open and close in time with the hands, in phase or in antiphase: ``(sample,)`` of bool."""
     settled = states[:, SETTLED:]
     hands, feet = (values - values.mean(dim=1, keepdim=True) for values in (_hands(settled), _feet(settled)))
     size = torch.linalg.vector_norm(hands, dim=1) * torch.linalg.vector_norm(feet, dim=1)
@@ -262,8 +259,7 @@ def distances(generated: Tensor, real: Tensor, seed: int, judge: Judge | None = 
 
     Args:
         generated, real: windows ``(sample, 32, 42)``; a random subset of the larger set is compared.
-        seed: seed of the subsample.
-        judge: source of features; ``None`` for the shipped judge.
+        seed, judge: seed of the subset, and source of features, by default the shipped judge.
 
     Returns:
         ``fid``, ``kid`` (times 1,000), and ``number`` of windows per side; below :data:`ENOUGH` the Frechet distance means little.

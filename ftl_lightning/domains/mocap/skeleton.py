@@ -93,6 +93,11 @@ class Poses(NamedTuple):
     positions: NDArray[np.float64]
     root: NDArray[np.float64]
 
+    @property
+    def states(self) -> NDArray[np.float32]:
+        """States ``(frame, 42)``."""
+        return self.positions.astype(np.float32).reshape(-1, len(COLUMNS))
+
 
 def z_up(joints: NDArray[np.float64]) -> NDArray[np.float64]:
     """Convert points ``(..., 3)`` from y up to z up."""
@@ -111,11 +116,6 @@ def normalised(joints: NDArray[np.float64]) -> Poses:
     x, y, z = np.moveaxis(joints - middle[:, None], -1, 0)
     turned = np.stack((cosine * x + sine * y, cosine * y - sine * x, z), axis=-1)
     return Poses(turned, np.concatenate((middle, yaw[:, None]), axis=1))
-
-
-def every(raw_fps: int) -> int:
-    """Subsampling factor of a recording to :data:`FPS`."""
-    return max(1, round(raw_fps / FPS))
 
 
 _RIGHT_SIDE = (
@@ -171,13 +171,7 @@ def _turned(joints: Tensor, limb: tuple[int, ...], angle: Tensor) -> None:
 
 
 def fit_poses(poses: Tensor, directions: int, path: Path) -> None:
-    """Write the Gaussian of :func:`drawn_poses`, with few principal directions.
-
-    Args:
-        poses: ``(pose, 42)`` in metres.
-        directions: number of directions of greatest variance.
-        path: the file.
-    """
+    """Write the Gaussian of :func:`drawn_poses`: mean and principal directions of poses ``(pose, 42)`` in metres."""
     mean = poses.double().mean(dim=0)
     _, size, axes = torch.linalg.svd(poses.double() - mean, full_matrices=False)
     scaled = axes[:directions] * size[:directions, None] / (len(poses) - 1) ** 0.5

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -39,12 +39,12 @@ from ftl_lightning.domains.mocap.tasks import (
     HELD_OUT,
     NEW_CONCEPTS,
     SEGMENTS,
+    SHIPPED,
     TRAINING_CONCEPTS,
     Segment,
     cleaned,
     mirrored_text,
     read_segments,
-    shipped_segments,
 )
 from ftl_lightning.services.errors import UserError, require, short
 from ftl_lightning.services.limits import check_readable
@@ -69,13 +69,11 @@ class Recordings:
     """Concatenated trials.
 
     Attributes:
-        positions: ``(frame, 14, 3)`` float32, metres, see :mod:`ftl_lightning.domains.mocap.skeleton`.
-        root: ``(frame, 4)`` float32: middle of the hips (x, y, z in metres) and yaw in radians.
-        offsets: ``(trial + 1,)`` int64: trial i has the frames ``offsets[i]:offsets[i + 1]``.
-        trial_id: such as ``13_29``.
-        label: description of each trial, cleaned.
-        kind: source format of each trial, such as ``asf_amc``.
-        subject: subject of each trial, such as ``13``.
+        positions: ``(frame, 14, 3)`` in metres, see :mod:`ftl_lightning.domains.mocap.skeleton`.
+        root: ``(frame, 4)``: middle of the hips (x, y, z in metres) and yaw in radians.
+        offsets: ``(trial + 1,)``: trial i has the frames ``offsets[i]:offsets[i + 1]``.
+        trial_id, label, kind, subject: of each trial: such as ``13_29``; cleaned description; source format, such as ``asf_amc``;
+            such as ``13``.
     """
 
     positions: NDArray[np.float32]
@@ -144,19 +142,21 @@ def _check(path: Path, arrays: Mapping[str, Any]) -> None:
 
 
 @cache
-def read_folder(root: Path) -> tuple[Recordings, tuple[Segment, ...]]:
+def read_folder(root: Path | None) -> tuple[Recordings, tuple[Segment, ...]]:
     """Recordings of a folder, and the segments of single actions: the folder's ``segments.csv``, else the shipped segments.
 
     Raises:
         UserError: for a missing folder, missing recordings, or damaged recordings.
     """
+    if root is None:
+        raise UserError(f"data.root: expected a folder of recordings, found none; {WHERE}")
     present = f"{'a file' if root.exists() else 'nothing'} at {short(str(root))}; {WHERE}"
     require(root.is_dir(), "data.root", "a folder of recordings", present)
     path = next((root / name for name in FILES if (root / name).is_file()), None)
     if path is None:
         raise UserError(f"{root}: expected {FILE}, found {'other files' if any(root.iterdir()) else 'an empty folder'}; {WHERE}")
     segments = root / SEGMENTS
-    return Recordings.load(path), read_segments(segments) if segments.is_file() else shipped_segments()
+    return Recordings.load(path), read_segments(segments if segments.is_file() else SHIPPED)
 
 
 MAX_SPEED = 12.0
@@ -189,15 +189,8 @@ def moving(motions: Sequence[Tensor], concepts: Sequence[str], provenance: Mappi
     )
 
 
-@dataclass(frozen=True)
-class Piece:
-    """Part of a trial without glitches, at least as long as a window.
-
-    Attributes:
-        trial: number of the trial.
-        concept: concept of the motion.
-        states: ``(frame, 42)`` float32.
-    """
+class Piece(NamedTuple):
+    """Part of a trial, given by number, without glitches; its states ``(frame, 42)`` are at least as long as a window."""
 
     trial: int
     concept: str
@@ -210,29 +203,19 @@ class Piece:
 
 @dataclass(frozen=True)
 class Recorded:
-    """Recordings of a folder, read lazily.
-
-    Attributes:
-        root: the folder; ``None`` for rule-based initial poses only.
-    """
+    """Recordings of a folder, read lazily; without a folder, a source of rule-based initial poses only."""
 
     root: Path | None
 
     @property
     def recordings(self) -> Recordings:
         """All trials of the folder."""
-        return self._folder[0]
+        return read_folder(self.root)[0]
 
     @property
     def segments(self) -> tuple[Segment, ...]:
         """Segments of single actions."""
-        return self._folder[1]
-
-    @property
-    def _folder(self) -> tuple[Recordings, tuple[Segment, ...]]:
-        if self.root is None:
-            raise UserError(f"data.root: expected a folder of recordings, found none; {WHERE}")
-        return read_folder(self.root)
+        return read_folder(self.root)[1]
 
     def split(self, name: Split, count: int, seed: int) -> Demonstrations:
         """All pieces of trials of the training concepts, and in ``'train'`` their mirror images.
@@ -255,9 +238,8 @@ class Recorded:
     def draw(self, task: str, count: int, seed: int, workers: int = 1) -> Demonstrations:
         """Demonstrations of a concept, without replacement if there are enough.
 
-        For a new concept, windows as long as a plan, each from the pose nearest to standing at rest (:func:`at_rest`), which aligns
-        variation over a plan in time. If there are too few, windows from random frames follow. For a training concept, pieces of
-        its trials.
+        For a new concept, windows as long as a plan, each from a pose nearest to standing at rest, which aligns them in time. If
+        there are too few, windows from random frames follow. For a training concept, pieces of its trials.
 
         Raises:
             UserError: if no trial of the folder shows the concept.
@@ -278,8 +260,7 @@ class Recorded:
         """Initial poses, with equal probability of trials.
 
         For a training concept, poses of its trials, held out if possible. Otherwise poses of people who stand or walk with arms
-        down, in validation trials without demonstrators of new concepts. Without a folder, rule-based poses, see
-        :mod:`ftl_lightning.domains.mocap.skeleton`.
+        down, in validation trials without demonstrators of new concepts. Without a folder, rule-based poses.
 
         Raises:
             UserError: if the folder has neither.
@@ -301,8 +282,8 @@ class Recorded:
             UserError: if there is none.
         """
         subjects = self.recordings.subject
-        trials = {trial: self.recordings.trial(trial) for trial in sorted(self._validation)}
-        poses = [torch.from_numpy(trials[trial]) for trial in trials if subjects[trial] not in DEMONSTRATORS]
+        trials = [trial for trial in sorted(self._validation) if subjects[trial] not in DEMONSTRATORS]
+        poses = [torch.from_numpy(self.recordings.trial(trial)) for trial in trials]
         hanging = tuple(down for states in poses if len(down := states[hang_down(states)]))
         require(hanging, str(self.root), "held-out trials in which someone stands with arms down", "none")
         return hanging

@@ -1,7 +1,11 @@
-"""Scripted experts: policies that command the next hand position from the object positions."""
+"""Scripted experts: policies that command the next hand position from the object positions.
+
+A push is a function of the current positions alone. A low hand behind the circle pushes. Any other hand rises, travels above the
+table, and descends behind the circle. The same rule thus starts a push and restarts it when the circle has slipped away.
+"""
 
 import math
-from collections.abc import Generator, Sequence
+from collections.abc import Generator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -83,8 +87,8 @@ def pushed(hand: Place, circle: Place, goal: Place, manner: Manner) -> Place:
     is a dipole field (Igarashi et al., 2010).
 
     Args:
-        hand: ``(3,)``.
-        circle, goal: ``(2,)``, the circle's centre and its goal; metres.
+        hand: ``(3,)`` in metres.
+        circle, goal: ``(2,)``, the circle's centre and its goal in metres.
         manner: style of the push.
     """
     along, to = complex(*(goal - circle)), complex(*(circle - hand[:2]))
@@ -114,14 +118,12 @@ def around(circle: Place, goal: Place, bowl: Place) -> Place:
     """Next goal ``(2,)`` of the circle on the way around the bowl to a goal, :data:`AHEAD` along the path.
 
     The path leads straight to the ring around the bowl, along its shorter side, and straight on.
-
-    Args:
-        circle, goal, bowl: centres ``(2,)``.
     """
     line = goal - circle
     distance = max(float(np.linalg.norm(line)), 1e-6)
     along = line / distance
-    beside, passed = _cross(along, bowl - circle), float(along @ (bowl - circle))
+    off = bowl - circle
+    beside, passed = float(along[0] * off[1] - along[1] * off[0]), float(along @ off)
     if abs(beside) >= RING or not 0 < passed < distance:
         return goal
     side = 1.0 if beside > 0 else -1.0  # counter-clockwise is 1
@@ -129,17 +131,9 @@ def around(circle: Place, goal: Place, bowl: Place) -> Place:
     sweep = (side * (last - first)) % (2 * math.pi)
     angles = first + side * np.linspace(0, sweep, max(2, int(RING * sweep / 0.005)))
     arc = bowl + RING * np.stack((np.cos(angles), np.sin(angles)), axis=-1)
-    return _on(np.concatenate((circle[None], arc, goal[None])), AHEAD)
-
-
-def _on(way: Place, distance: float) -> Place:
-    """Point on a path ``(n, 2)`` at a distance from its start, or its end."""
-    travelled = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1))))
-    return np.array([np.interp(distance, travelled, column) for column in way.T])
-
-
-def _cross(first: Sequence[float] | Place, second: Sequence[float] | Place) -> float:
-    return float(first[0] * second[1] - first[1] * second[0])
+    path = np.concatenate((circle[None], arc, goal[None]))
+    travelled = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))))
+    return np.array([np.interp(AHEAD, travelled, column) for column in path.T])
 
 
 def _tangent(centre: Place, place: Place, turn: float) -> float:
@@ -174,16 +168,15 @@ RETURN = 0.8
 MISLAID = 0.6
 """Recoveries: probability that the circle is moved."""
 LYING, RISING, OVER = 0.5, 0.4, 0.03
-"""Recoveries: probability of a low hand, probability of a hand beside the circle otherwise, and height in metres above push height
-from which the hand may be over the circle."""
+"""Recoveries: probability of a low hand; probability that any other hand is beside the circle; minimum height in metres above push
+height of a hand over the circle."""
 ASTRAY, REACHED = ((0.32, 0.70), (-0.28, 0.28)), ((0.26, 0.77), (-0.35, 0.35))
 """Recoveries: x and y ranges of circle and hand."""
-OPENED = 0.5
-"""Recoveries of picks: probability of an open hand."""
-HIGHEST = 0.16
-"""Recoveries of picks: maximum hand height in metres above push height."""
+OPENED, HIGHEST = 0.5, 0.16
+"""Recoveries of picks: probability of an open hand, and maximum hand height in metres above push height."""
 AROUND, ROOM, FARTHEST_PUSH = (0.034, 0.08), 0.012, 0.33
-"""Recoveries, in metres: range from circle to hand, minimum gap from circle to other objects, maximum distance to the target."""
+"""Recoveries, in metres: range of the distance between hand and circle; minimum gap between the circle and other objects; maximum
+distance of a push."""
 APART_FROM = 0.12
 """Centre distance in metres between an object and the circle placed beside it; leaves room for open fingers."""
 
@@ -199,7 +192,8 @@ class Style:
         speed: factor of all speeds.
         behind, aside: start of a push in metres, behind the circle and left of the line to its goal.
         hover: travel height in metres.
-        grasp, place: offsets from the circle's centre in metres, and from its goal as a share (-1..1) of the allowed spread.
+        grasp: x and y of the grasp relative to the circle's centre, in metres.
+        place: x and y of the final position relative to the goal, as a fraction (-1..1) of the allowed spread.
     """
 
     speed: float
@@ -232,6 +226,9 @@ class _Expert:
     def circle(self) -> Place:
         return self.env.places()[CIRCLE]
 
+    def goal(self) -> Place:
+        return self.env.places()[TARGET[self.task]][:2]
+
     def go(self, place: Place, speed: float, opening: float) -> Moves:
         """Move straight, with smooth start and end, at most ``speed`` metres per step. Deviations from the line decay."""
         start, goal = self.at[:3].copy(), np.asarray(place, dtype=np.float64)
@@ -251,12 +248,10 @@ class _Expert:
 
 
 def moves(env: "TableTopEnvironment", task: str, how: Style, height: float | None = None, feedback: bool = True) -> Moves:
-    """Generate the commands of a task's expert in the current scene.
+    """Generate the commands of a task's expert in the current scene; the environment is not stepped.
 
     Args:
-        env: environment after reset; it is not stepped.
-        task: known task.
-        how: style of the demonstration.
+        env, task, how: environment after reset, known task, and style of the demonstration.
         height: push height in metres above the table; by default above the surface under the circle.
         feedback: whether pushes observe the circle; otherwise they go straight to the triangle's initial position.
     """
@@ -299,16 +294,6 @@ def _target(expert: _Expert) -> tuple[Place, float]:
     return thing + (APART_FROM + 0.005 * how.place[0]) * along + 0.01 * how.place[1] * np.array([-along[1], along[0]]), 0.0
 
 
-def _behind(expert: _Expert, goal: Place) -> Place:
-    """Return the start of an open-loop push of the circle to a goal."""
-    circle = expert.circle()[:2]
-    return circle - expert.how.behind * (goal - circle) / np.linalg.norm(goal - circle)
-
-
-def _goal(expert: _Expert) -> Place:
-    return expert.env.places()[TARGET[expert.task]][:2]
-
-
 def _push(expert: _Expert, height: float) -> Moves:
     """Push the circle to the task's target, with feedback."""
     how = expert.how
@@ -316,7 +301,7 @@ def _push(expert: _Expert, height: float) -> Moves:
     manner = Manner(height, speed, how.speed, how.behind, how.aside)
     bowl = expert.env.scene[COLUMNS[BOWL]][1:3].astype(np.float64)
     while True:
-        circle, goal = expert.circle()[:2], _goal(expert)
+        circle, goal = expert.circle()[:2], expert.goal()
         if expert.task == AROUND_BOWL:
             goal = around(circle, goal, bowl)
         expert.at = np.array([*pushed(expert.env.command[:3], circle, goal, manner), CLOSED])
@@ -325,8 +310,8 @@ def _push(expert: _Expert, height: float) -> Moves:
 
 def _straight(expert: _Expert, height: float) -> Moves:
     """Push along the initial line from the circle to the task's target."""
-    goal = _goal(expert).copy()
-    begin = _behind(expert, goal)
+    circle, goal = expert.circle()[:2], expert.goal()
+    begin = circle - expert.how.behind * (goal - circle) / np.linalg.norm(goal - circle)
     yield from expert.go(np.array([*begin, height + 0.06]), 0.016, CLOSED)
     yield from expert.go(np.array([*begin, height]), 0.011, CLOSED)
     along = (goal - begin) / np.linalg.norm(goal - begin)
@@ -338,12 +323,8 @@ def _straight(expert: _Expert, height: float) -> Moves:
 def led_astray(env: "TableTopEnvironment", task: str, rng: np.random.Generator) -> dict[str, NDArray[Any]]:
     """Start a recovery from a failure: the hand on any side of the circle, low or above it, open or closed and empty in picks.
 
-    With probability :data:`MISLAID` the circle lies elsewhere, also outside its initial range. Open hands are above it.
-
-    Args:
-        env: environment reset to a scene of the task, which is changed.
-        task: known task.
-        rng: random generator.
+    With probability :data:`MISLAID` the circle lies elsewhere, also outside its initial range. Open hands are above it. The
+    environment was reset to a scene of the task, which is changed.
     """
     circle, others = env.places()[CIRCLE], {name: env.outline(name) for name in env.bodies.objects if name != CIRCLE}
     below, picks = support(env.scene, CIRCLE), task not in PUSHES

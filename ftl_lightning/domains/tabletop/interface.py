@@ -13,7 +13,7 @@ from ftl_lightning.data.features import Feature, Observed
 from ftl_lightning.domains.domain import View
 from ftl_lightning.domains.physics import Simulator, pybullet
 from ftl_lightning.domains.tasks import EvaluationTask, Suite, training_suite
-from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.errors import require
 from ftl_lightning.services.extras import check_extra
 from ftl_lightning.services.processes import drawn
 
@@ -84,11 +84,7 @@ OPEN, THRESHOLD = 0.08, 0.06
 
 
 def check_simulator() -> None:
-    """Require pybullet.
-
-    Raises:
-        UserError: with the command that installs it.
-    """
+    """Check that pybullet is installed; the ``UserError`` has the command that installs it."""
     check_extra("tabletop", f"domain {NAME}: its simulator")
 
 
@@ -132,13 +128,8 @@ WIDE_SUITES = {
 
 
 def check_task(task: str) -> str:
-    """Return a known task.
-
-    Raises:
-        UserError: for an unknown task.
-    """
-    if task not in TASKS:
-        raise UserError(f"table-top task: expected one of {', '.join(map(repr, TASKS))}, found {task!r}")
+    """Return a known task; raise a ``UserError`` for an unknown one."""
+    require(task in TASKS, "table-top task", f"one of {', '.join(map(repr, TASKS))}", repr(task))
     return task
 
 
@@ -205,20 +196,12 @@ def moved(states: Tensor, observed: Observed, mirrored: Tensor, angles: Tensor, 
 
 
 def raised(states: Tensor, observed: Observed, heights: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-    """Raise the table: states and positions. Images from above would not show it.
-
-    Args:
-        states: ``(sample, horizon, 4)``.
-        observed: ``pose`` and the privileged ``places``.
-        heights: ``(sample,)`` in metres.
-    """
-    result = dict(observed)
-    result[POSE], result[PLACES] = observed[POSE].clone(), observed[PLACES].clone()
-    result[POSE][:, 2] += heights
-    result[PLACES][..., 3] += heights[:, None]
-    states = states.clone()
+    """Raise the table by heights ``(sample,)`` in metres: states, ``pose`` and ``places``. Images from above would not show it."""
+    states, pose, places = states.clone(), observed[POSE].clone(), observed[PLACES].clone()
+    pose[:, 2] += heights
+    places[..., 3] += heights[:, None]
     states[..., 2] += heights[:, None]
-    return states, result
+    return states, {**observed, POSE: pose, PLACES: places}
 
 
 def misplaced(read: Tensor, places: Tensor) -> Tensor:
@@ -266,28 +249,22 @@ def _perturb(states: Tensor, observed: Observed, draw: torch.Generator | None) -
     return raised(states, observed, RAISED * (2 * height - 1).clamp(min=0))
 
 
-def _start(observed: Observed) -> Tensor:
-    """Initial state of a plan ``(sample, 1, 4)``."""
-    return observed[POSE][:, None, list(FEATURES[POSE].state)]
-
-
 def _place(observed: Observed) -> Tensor:
     """Origin of states with the view ``hand``: hand position, and zero opening, ``(sample, 1, 4)``."""
-    return functional.pad(_start(observed)[..., :3], (0, 1))
-
-
-def _with_origin(observed: Observed) -> dict[str, Tensor]:
-    away = (observed[POSE][:, :2] - observed[POSE].new_tensor(MIDDLE)) / -HALF
-    return {**observed, ORIGIN: away.flip(1)}
+    return functional.pad(observed[POSE][:, None, :3], (0, 1))
 
 
 def _with_place(observed: Observed) -> dict[str, Tensor]:
     return {**observed, ORIGIN: (observed[POSE][:, :2] - observed[POSE].new_tensor(MIDDLE)) / HALF}
 
 
+def _with_pixel(observed: Observed) -> dict[str, Tensor]:
+    return {**observed, ORIGIN: -_with_place(observed)[ORIGIN].flip(1)}
+
+
 _FROM_HAND = View(
     features={**FEATURES, ORIGIN: Feature((2,))},
-    observe=_with_origin,
+    observe=_with_pixel,
     encode=lambda states, observed: states - _place(observed),
     decode=lambda states, observed: states + _place(observed),
     perturb=_perturb,

@@ -36,7 +36,7 @@ from ftl_lightning.domains.tabletop.interface import (
 )
 from ftl_lightning.domains.tabletop.scenes import HEIGHT, HIDDEN, NEEDED, PRESENT, SURFACES, draw_scene, free_pose, outline, scenes
 from ftl_lightning.domains.tabletop.world import turned
-from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.errors import require
 from ftl_lightning.services.seeding import VALIDATION_SEED, task_key
 
 _LOG = logging.getLogger(__name__)
@@ -171,14 +171,8 @@ def perform(
     if scatter:
         pictures, places = scattered(env, task, info["trace"], rng)
         images, places = list(pictures), _stayed(list(places))
-    return Episode(
-        _stayed(commands).astype(np.float32),
-        np.stack(actions),
-        _stayed(images),
-        _stayed(poses).astype(np.float32),
-        success,
-        places,
-    )
+    states, measured = _stayed(commands).astype(np.float32), _stayed(poses).astype(np.float32)
+    return Episode(states, np.stack(actions), _stayed(images), measured, success, places)
 
 
 def _stayed(values: list[Any]) -> NDArray[Any]:
@@ -197,12 +191,7 @@ def _scene(job: Job) -> np.ndarray:
 
 
 def _episode(job: Job) -> Episode | None:
-    """Run an episode of the expert; ``None`` if the simulator raised an error.
-
-    Raises:
-        MemoryError, OSError: for a lack of resources, which would affect every episode.
-        UserError: if the simulator does not start.
-    """
+    """Run an episode of the expert; ``None`` if the simulator raised an error, except for a lack of resources."""
     task, seed, number, scatter, elsewhere = job
     if not _ENVIRONMENT:
         _ENVIRONMENT.append(TableTopEnvironment())
@@ -238,9 +227,7 @@ def demonstrations(
 
     Args:
         task: known task.
-        count: number of demonstrations.
-        seed: seed of scenes, styles and noise.
-        workers: number of processes.
+        count, seed, workers: numbers of demonstrations and processes, and seed of scenes, styles and noise.
         progress: called after each successful episode.
         scatter: whether to scatter distractors in each image, with object positions as a privileged feature.
         elsewhere: whether episodes are recoveries, with the hand anywhere around the circle.
@@ -258,8 +245,7 @@ def demonstrations(
             progress()
         if len(kept) == count:
             break
-    else:
-        raise UserError(f"table-top {task!r}: expected {count} successful episodes of {tried}, found {len(kept)}")
+    require(len(kept) == count, f"table-top {task!r}", f"{count} successful episodes of {tried}", len(kept))
     drawn = torch.from_numpy(np.stack([_scene(job) for job, _ in kept]))
     provenance = {"generator": NAME, "seed": seed, "count": count, "tried": tried, "rejected": tried - count}
     return joined_episodes(task, [episode for _, episode in kept], drawn, provenance)
@@ -268,20 +254,11 @@ def demonstrations(
 def joined_episodes(
     task: str, episodes: Sequence[Episode], drawn: torch.Tensor | None, provenance: Mapping[str, Any]
 ) -> Demonstrations:
-    """Demonstrations from episodes of a task.
-
-    Args:
-        task: known task.
-        episodes: all with places, or none.
-        drawn: their scenes ``(episode, 24)``; ``None`` if they did not start from a scene.
-        provenance: record of their origin.
-    """
-    observed = {
-        IMAGE: padded([torch.from_numpy(episode.images) for episode in episodes])[0],
-        POSE: padded([torch.from_numpy(episode.poses) for episode in episodes])[0],
-    }
-    if places := [torch.from_numpy(episode.places) for episode in episodes if episode.places is not None]:
-        observed[PLACES] = padded(places)[0]
+    """Demonstrations from episodes of a task, and their scenes ``(episode, 24)``, if any; all have places, or none has."""
+    columns = {IMAGE: [episode.images for episode in episodes], POSE: [episode.poses for episode in episodes]}
+    if places := [episode.places for episode in episodes if episode.places is not None]:
+        columns[PLACES] = places
+    observed = {name: padded([torch.from_numpy(values) for values in rows])[0] for name, rows in columns.items()}
     states, lengths = padded([torch.from_numpy(episode.commands) for episode in episodes])
     return Demonstrations(
         states=states,
