@@ -1,4 +1,7 @@
-"""Observations and actions of the table-top, without the simulator."""
+"""Table-top without the simulator: cameras, observations, actions, tasks, and views for models.
+
+Views transform scenes at random in training.
+"""
 
 import math
 from dataclasses import dataclass, replace
