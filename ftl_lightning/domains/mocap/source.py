@@ -93,8 +93,9 @@ class Recordings:
 
     def save(self, path: Path) -> None:
         """Write the recordings atomically."""
+        arrays: dict[str, Any] = {key: np.array(getattr(self, key)) for key in _KEYS}
         with atomic(path) as temporary, temporary.open("wb") as file:
-            np.savez_compressed(file, **{key: np.array(getattr(self, key)) for key in _KEYS})
+            np.savez_compressed(file, **arrays)
 
     @classmethod
     def load(cls, path: Path) -> Self:

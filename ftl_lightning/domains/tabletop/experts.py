@@ -175,8 +175,8 @@ ASTRAY, REACHED = ((0.32, 0.70), (-0.28, 0.28)), ((0.26, 0.77), (-0.35, 0.35))
 OPENED, HIGHEST = 0.5, 0.16
 """Recoveries of picks: probability of an open hand, and maximum hand height in metres above push height."""
 AROUND, ROOM, FARTHEST_PUSH = (0.034, 0.08), 0.012, 0.33
-"""Recoveries, in metres: range of the distance between hand and circle; minimum gap between the circle and other objects; in pushes,
-maximum distance between the circle and its target."""
+"""Recoveries, in metres: range of the distance between hand and circle; minimum gap between the circle and other objects; maximum
+distance between the circle and the target of a push."""
 APART_FROM = 0.12
 """Centre distance in metres between an object and the circle placed beside it; leaves room for open fingers."""
 

@@ -255,9 +255,12 @@ def joined_episodes(
     task: str, episodes: Sequence[Episode], drawn: torch.Tensor | None, provenance: Mapping[str, Any]
 ) -> Demonstrations:
     """Demonstrations from episodes of a task, and their scenes ``(episode, 24)``, if any; all have places, or none has."""
-    columns = {IMAGE: [episode.images for episode in episodes], POSE: [episode.poses for episode in episodes]}
-    if places := [episode.places for episode in episodes if episode.places is not None]:
-        columns[PLACES] = places
+    places = [episode.places for episode in episodes if episode.places is not None]
+    columns: dict[str, list[NDArray[Any]]] = {
+        IMAGE: [episode.images for episode in episodes],
+        POSE: [episode.poses for episode in episodes],
+    }
+    columns |= {PLACES: places} if places else {}
     observed = {name: padded([torch.from_numpy(values) for values in rows])[0] for name, rows in columns.items()}
     states, lengths = padded([torch.from_numpy(episode.commands) for episode in episodes])
     return Demonstrations(
