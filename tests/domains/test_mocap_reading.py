@@ -145,7 +145,7 @@ def test_what_was_dropped_is_told_with_its_reason(tmp_path: Path) -> None:
     assert "     1  description that is no training concept: 02_03 (juggling)\n" in text
     assert "     1  no description in the index: 02_04\n" in text
     assert "     1  shorter than 128 frames: 02_05 (100 frames)\n" in text
-    assert "02_06.amc: line 15: expected numbers, found 'lradius zero'" in text
+    assert "02_06.amc: line 15: expected a finite number, found 'zero'" in text
     assert "     1  less than 32 frames without glitches: 02_07 (of 40)\n" in text
     assert "     1  no skeleton of the subject: 05_08 (05.asf)\n" in text
     assert "     1  file not named after a trial, such as 13_29.amc: readme.amc\n" in text
