@@ -13,7 +13,7 @@ import pytest
 from packaging.requirements import Requirement
 
 from ftl_lightning.data.demonstrations import Demonstrations
-from ftl_lightning.domains.driving.shipped import SHIPPED
+from ftl_lightning.domains.driving.traffic import SHIPPED
 from ftl_lightning.domains.mocap.measures import learned_elsewhere
 from ftl_lightning.reporting.figures import concept_map
 from ftl_lightning.services.errors import UserError

@@ -15,7 +15,7 @@ import ftl_lightning
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.agent.scenes import OBSERVED
-from ftl_lightning.domains.driving.shipped import SHIPPED
+from ftl_lightning.domains.driving.traffic import SHIPPED
 from ftl_lightning.few_shot.learner import FewShot, LearnedConcept
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import Concept

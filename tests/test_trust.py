@@ -14,9 +14,9 @@ from nbclient import NotebookClient
 
 from ftl_lightning.cli.main import main
 from ftl_lightning.data.demonstrations import Demonstrations
-from ftl_lightning.domains.driving.shipped import SHIPPED
+from ftl_lightning.domains.driving.traffic import SHIPPED
 from ftl_lightning.domains.registry import load_domain
-from ftl_lightning.domains.tabletop.tasks import PUSH
+from ftl_lightning.domains.tabletop.interface import PUSH
 from ftl_lightning.evaluation.results import COLUMNS
 from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.igm.concept import VERSION

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import torch
 
+from ftl_lightning.domains.mocap.skeleton import fit_poses
 from ftl_lightning.domains.mocap.source import Recorded
-from ftl_lightning.domains.mocap.standing import fit_poses
 
 EACH = 40
 """Poses of a trial at most, at equal distances."""

@@ -18,13 +18,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from ftl_lightning.domains.mocap.actions import TESTED, action
-from ftl_lightning.domains.mocap.kinematics import SETTLED
-from ftl_lightning.domains.mocap.measures import distances, diversity, learned_elsewhere, multimodality
-from ftl_lightning.domains.mocap.skeleton import HORIZON
-from ftl_lightning.domains.mocap.source import POSE, Recorded, at_rest, pieces
-from ftl_lightning.domains.mocap.tasks import DEMONSTRATORS
-from ftl_lightning.domains.mocap.views import begun_elsewhere
+from ftl_lightning.domains.mocap.domain import begun_elsewhere
+from ftl_lightning.domains.mocap.measures import SETTLED, distances, diversity, learned_elsewhere, multimodality
+from ftl_lightning.domains.mocap.skeleton import HORIZON, POSE
+from ftl_lightning.domains.mocap.source import Recorded, at_rest, pieces
+from ftl_lightning.domains.mocap.tasks import DEMONSTRATORS, TESTED, action
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.igm.samplers import Sampling
@@ -105,7 +103,7 @@ def said(model: ConceptModel, *texts: str) -> Composition:
 def variation(model: ConceptModel, composition: Composition, starts: Tensor, seed: int) -> float:
     """How far samples from one start are from their mean: metres, root mean square over samples, joints and frames.
 
-    Of frames that no longer come from the start, see :data:`~ftl_lightning.domains.mocap.kinematics.SETTLED`.
+    Of frames that no longer come from the start, see :data:`~ftl_lightning.domains.mocap.measures.SETTLED`.
     """
     each = starts[:STARTS].repeat_interleave(EACH, dim=0)
     return spread(generated(model, composition, each, seed).unflatten(0, (-1, EACH)))

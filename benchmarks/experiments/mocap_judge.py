@@ -26,7 +26,7 @@ from sklearn.linear_model import LogisticRegression
 from torch import Tensor
 from torch.nn import functional
 
-from ftl_lightning.domains.mocap.actions import CLASSES, OTHER, REVERSIBLE, STANDING, STEPPING, TESTED, action, of_legs
+from ftl_lightning.domains.mocap.domain import begun_elsewhere
 from ftl_lightning.domains.mocap.features import (
     LA,
     LE,
@@ -48,10 +48,9 @@ from ftl_lightning.domains.mocap.features import (
     sizes,
 )
 from ftl_lightning.domains.mocap.judge import LEGS, NUMBERS, PARTS, PATH, VERIFIED_BY, WHOLE, Judge, Network, Recogniser
-from ftl_lightning.domains.mocap.recordings import read_folder
-from ftl_lightning.domains.mocap.skeleton import ANKLES, FPS, HORIZON, JOINTS, as_joints, mirrored
-from ftl_lightning.domains.mocap.source import POSE
-from ftl_lightning.domains.mocap.views import begun_elsewhere
+from ftl_lightning.domains.mocap.skeleton import ANKLES, FPS, HORIZON, JOINTS, POSE, as_joints, mirrored
+from ftl_lightning.domains.mocap.source import read_folder
+from ftl_lightning.domains.mocap.tasks import CLASSES, OTHER, REVERSIBLE, STANDING, STEPPING, TESTED, action, of_legs
 from ftl_lightning.services.tensor_file import file_hash, write_text
 
 UNSEEN = ("13",)

@@ -12,7 +12,7 @@ import torch
 from mocap_distances import stretches, windows
 from torch import Tensor
 
-from ftl_lightning.domains.mocap.kinematics import RULES
+from ftl_lightning.domains.mocap.measures import RULES
 from ftl_lightning.domains.mocap.source import Recorded
 from ftl_lightning.services.tensor_file import write_text
 

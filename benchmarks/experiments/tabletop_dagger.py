@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 
 from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
-from ftl_lightning.domains.tabletop.experts import Episode, perform
+from ftl_lightning.domains.tabletop.interface import AROUND_BOWL, PUSH, PUSHES
 from ftl_lightning.domains.tabletop.scenes import draw_scene
-from ftl_lightning.domains.tabletop.source import joined_episodes
-from ftl_lightning.domains.tabletop.tasks import AROUND_BOWL, PUSH, PUSHES
+from ftl_lightning.domains.tabletop.source import Episode, joined_episodes, perform
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.services.progress import bar

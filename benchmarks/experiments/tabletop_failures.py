@@ -33,12 +33,10 @@ from ftl_lightning.data.features import Observed
 from ftl_lightning.domains.domain import closed_loop_of
 from ftl_lightning.domains.tabletop import DOMAIN
 from ftl_lightning.domains.tabletop.environment import TOUCH, Seen, TableTopEnvironment
-from ftl_lightning.domains.tabletop.experts import PUSH_HEIGHT, SLOWER, SPEED
-from ftl_lightning.domains.tabletop.interface import POSE
-from ftl_lightning.domains.tabletop.pushing import FARTHEST, LOW, WIDEST, Manner, around, pushed
+from ftl_lightning.domains.tabletop.experts import FARTHEST, LOW, PUSH_HEIGHT, SLOWER, SPEED, WIDEST, Manner, around, pushed
+from ftl_lightning.domains.tabletop.interface import AROUND_BOWL, POSE, PUSH, PUSH_ON_BOOK, PUSHES, TASKS
 from ftl_lightning.domains.tabletop.scenes import BOOK, BOWL, CIRCLE, COLUMNS, TRIANGLE, WHITE, gap, outline, outlines, support
 from ftl_lightning.domains.tabletop.source import initial_states
-from ftl_lightning.domains.tabletop.tasks import AROUND_BOWL, PUSH, PUSH_ON_BOOK, PUSHES, TASKS
 from ftl_lightning.evaluation.closed_loop import PlanFollower, planner, roll_out, sampled_plans
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import Concept

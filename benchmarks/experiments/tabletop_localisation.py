@@ -15,10 +15,9 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
+from ftl_lightning.domains.tabletop.interface import HALF, MIDDLE, TASKS
 from ftl_lightning.domains.tabletop.scenes import COLUMNS, scenes, support
 from ftl_lightning.domains.tabletop.source import initial_states
-from ftl_lightning.domains.tabletop.tasks import TASKS
-from ftl_lightning.domains.tabletop.views import HALF, MIDDLE
 from ftl_lightning.networks.image_encoder import POINT
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.progress import bar

@@ -20,6 +20,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ftl_lightning.domains.tabletop.interface import PUSH, PUSH_TO_BOOK, PUSH_TO_BOWL, PUSH_TO_WHITE
 from ftl_lightning.domains.tabletop.scenes import (
     BOOK,
     BOWL,
@@ -32,7 +33,6 @@ from ftl_lightning.domains.tabletop.scenes import (
     random_yaw,
     scene_of,
 )
-from ftl_lightning.domains.tabletop.tasks import PUSH, PUSH_TO_BOOK, PUSH_TO_BOWL, PUSH_TO_WHITE
 from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.services.errors import UserError

@@ -12,11 +12,9 @@ from pathlib import Path
 
 import torch
 
-from ftl_lightning.domains.mocap.kinematics import strides
+from ftl_lightning.domains.mocap.measures import is_stride
 from ftl_lightning.domains.mocap.rendering import film
-from ftl_lightning.domains.mocap.skeleton import L_ANKLE, R_ANKLE, as_joints
-from ftl_lightning.domains.mocap.source import POSE
-from ftl_lightning.domains.mocap.standing import standing_poses, walking_poses
+from ftl_lightning.domains.mocap.skeleton import L_ANKLE, POSE, R_ANKLE, as_joints, standing_poses, walking_poses
 from ftl_lightning.evaluation.animation import gif, side_by_side
 from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.services.tensor_file import atomic
@@ -35,7 +33,7 @@ def starts(seed: int) -> torch.Tensor:
     """Somebody level, and two strides, one with each foot in front: ``(3, 42)``."""
     draw = torch.Generator().manual_seed(seed)
     walking = walking_poses(200, draw)
-    wide = walking[strides(walking)]
+    wide = walking[is_stride(walking)]
     joints = as_joints(wide)
     right = joints[:, R_ANKLE, 1] > joints[:, L_ANKLE, 1]
     return torch.stack((standing_poses(1, draw)[0], wide[right][0], wide[~right][0]))

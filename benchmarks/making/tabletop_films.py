@@ -18,9 +18,9 @@ from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.domain import closed_loop_of
 from ftl_lightning.domains.tabletop import DOMAIN
-from ftl_lightning.domains.tabletop.policies import POLICIES
+from ftl_lightning.domains.tabletop.domain import POLICIES
+from ftl_lightning.domains.tabletop.interface import PUSH_ON_BOOK, TASKS
 from ftl_lightning.domains.tabletop.rendering import film
-from ftl_lightning.domains.tabletop.tasks import PUSH_ON_BOOK, TASKS
 from ftl_lightning.evaluation.animation import captioned, gif, outcome_text
 from ftl_lightning.evaluation.closed_loop import roll_out
 from ftl_lightning.few_shot.learner import FewShot

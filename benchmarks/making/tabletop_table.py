@@ -14,7 +14,7 @@ from typing import Any
 
 import pandas as pd
 
-from ftl_lightning.domains.tabletop.tasks import BESIDE_BOWL, PUSH, PUSH_ON_BOOK, PUSH_TO_BOOK, TRAINING_CONCEPTS, WIDE_CONCEPTS
+from ftl_lightning.domains.tabletop.interface import BESIDE_BOWL, PUSH, PUSH_ON_BOOK, PUSH_TO_BOOK, TRAINING_CONCEPTS, WIDE_CONCEPTS
 from ftl_lightning.services.tensor_file import write_text
 
 NEW, OLD, FROM_PUSH = "new concept", "training concept", "training representation"

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from ftl_lightning.apps.testing.strokes import NEW, TRAINING
+from ftl_lightning.apps.benchmark.strokes import NEW, TRAINING
 
 from ftl_lightning.apps.benchmark.strokes import strokes
 from ftl_lightning.data.check import check, mended, read_mended

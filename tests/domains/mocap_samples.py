@@ -12,9 +12,8 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from ftl_lightning.domains.mocap.recordings import FILE, Recordings
-from ftl_lightning.domains.mocap.skeleton import FPS, L_WRIST, R_WRIST
-from ftl_lightning.domains.mocap.standing import standing_poses
+from ftl_lightning.domains.mocap.skeleton import FPS, L_WRIST, R_WRIST, standing_poses
+from ftl_lightning.domains.mocap.source import FILE, Recordings
 
 BONES = {
     "lhipjoint": ("root", (1, -1, 0), 2.0, (0, 0, 0), ""),

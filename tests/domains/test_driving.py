@@ -10,12 +10,21 @@ import pytest
 import torch
 from highway_env.vehicle.behavior import IDMVehicle
 
-from ftl_lightning.domains.driving import expert, generation
+from ftl_lightning.domains.driving import expert
 from ftl_lightning.domains.driving.environment import DrivingEnvironment
-from ftl_lightning.domains.driving.scenarios import SCENARIOS, arrived, make, observe
-from ftl_lightning.domains.driving.shipped import training_set
-from ftl_lightning.domains.driving.simulation import advance, restore, save
-from ftl_lightning.domains.driving.traffic import NAMES, OBSERVED, SCENARIO, SCENE, STEP, TRAFFIC, decision_seconds, origin, scene
+from ftl_lightning.domains.driving.scenarios import SCENARIOS, advance, arrived, make, observe, restore, save
+from ftl_lightning.domains.driving.traffic import (
+    NAMES,
+    OBSERVED,
+    SCENARIO,
+    SCENE,
+    STEP,
+    TRAFFIC,
+    decision_seconds,
+    origin,
+    scene,
+    training_set,
+)
 from ftl_lightning.services.errors import UserError
 
 
@@ -192,7 +201,7 @@ def test_an_episode_repeats_and_starts_where_its_numbers_say() -> None:
     assert seen[SCENARIO].tolist() == [NAMES.index("roundabout")]
     other.reset(options={"scene": given})
     assert env.np_random.random() == other.np_random.random()  # draws among equal decisions
-    with pytest.raises(UserError, match="expected the start of 'roundabout'"):
+    with pytest.raises(UserError, match="expected the initial state of 'roundabout'"):
         env.reset(options={"scene": np.concatenate((first[2], given[OBSERVED:]))})
 
 
@@ -248,11 +257,11 @@ def test_demonstrations_drive_on_and_go_on_where_they_stopped(monkeypatch: pytes
 
     def drive(name: str, seed: int, blind: bool) -> tuple[np.ndarray, bool]:
         driven.append(seed)
-        return WHOLE * again.random(dtype=np.float32), seed != generation.episode_seed(0, 1)
+        return WHOLE * again.random(dtype=np.float32), seed != expert.episode_seed(0, 1)
 
     monkeypatch.setattr(expert, "drive", drive)
     told: list[int] = []
-    found = generation.demonstrations("merge", 2, 0, 1, lambda: told.append(1))
+    found = expert.demonstrations("merge", 2, 0, 1, lambda: told.append(1))
     assert len(told) == 2
     assert torch.equal(found.states, found.observed[TRAFFIC][..., :7])
     assert (found.provenance["driven"], found.provenance["rejected"]) == (3, 1)
@@ -262,13 +271,13 @@ def test_demonstrations_drive_on_and_go_on_where_they_stopped(monkeypatch: pytes
         assert len(beyond) >= 8
         straight = found.states[row, length - 1, 1] + beyond * found.states[row, -1, 3]
         torch.testing.assert_close(found.states[row, length:, 1], straight)
-        assert origin(begun) == ("merge", generation.episode_seed(0, 2 * row))
-    shard = generation.shard("merge", driven[-1])
+        assert origin(begun) == ("merge", expert.episode_seed(0, 2 * row))
+    shard = expert.shard("merge", driven[-1])
     shard.write_bytes(shard.read_bytes()[:-20])  # damaged: driven again
-    other = generation.demonstrations("merge", 2, 0, 1, lambda: None)
-    assert driven == [generation.episode_seed(0, number) for number in (0, 1, 2, 2)]
+    other = expert.demonstrations("merge", 2, 0, 1, lambda: None)
+    assert driven == [expert.episode_seed(0, number) for number in (0, 1, 2, 2)]
     assert other.hash != found.hash
-    assert generation.demonstrations("merge", 2, 0, 1, lambda: None).hash == other.hash
+    assert expert.demonstrations("merge", 2, 0, 1, lambda: None).hash == other.hash
     assert len(driven) == 4
 
 
@@ -280,24 +289,24 @@ def test_demonstrations_do_not_depend_on_workers(tmp_path: Path, monkeypatch: py
     found = []
     for workers in (1, 2):
         monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / f"{workers}"))
-        found.append(generation.demonstrations("roundabout", 1, 0, workers, lambda: None))
+        found.append(expert.demonstrations("roundabout", 1, 0, workers, lambda: None))
     assert found[0].hash == found[1].hash
 
 
 def test_an_episode_that_raises_counts_as_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
     def drive(name: str, seed: int, blind: bool) -> tuple[np.ndarray, bool]:
-        if seed == generation.episode_seed(0, 0):
+        if seed == expert.episode_seed(0, 0):
             raise RuntimeError("the simulator broke")
-        return WHOLE, seed != generation.episode_seed(0, 1)
+        return WHOLE, seed != expert.episode_seed(0, 1)
 
     monkeypatch.setattr(expert, "drive", drive)
-    found = generation.demonstrations("merge", 2, 0, 1, lambda: None)
+    found = expert.demonstrations("merge", 2, 0, 1, lambda: None)
     assert (found.provenance["driven"], found.provenance["rejected"]) == (4, 2)
-    assert not generation.shard("merge", generation.episode_seed(0, 0)).exists()  # next time it is driven again
-    assert generation.shard("merge", generation.episode_seed(0, 1)).exists()
+    assert not expert.shard("merge", expert.episode_seed(0, 0)).exists()  # next time it is driven again
+    assert expert.shard("merge", expert.episode_seed(0, 1)).exists()
     monkeypatch.setattr(expert, "drive", lambda *_, **options: (WHOLE, False))
     with pytest.raises(UserError, match="expected 1 successful episodes of 4, found 0"):
-        generation.demonstrations("exit", 1, 0, 1, lambda: None)
+        expert.demonstrations("exit", 1, 0, 1, lambda: None)
 
 
 @pytest.mark.parametrize("failure", [MemoryError(), OSError(24, "Too many open files")])
@@ -308,16 +317,16 @@ def test_a_machine_that_fails_decides_nothing(failure: Exception, monkeypatch: p
     with monkeypatch.context() as broken:
         broken.setattr(expert, "drive", fail)
         with pytest.raises(UserError, match=r"driving 'merge', seed \d+: the machine failed"):
-            generation.demonstrations("merge", 1, 0, 1, lambda: None)
+            expert.demonstrations("merge", 1, 0, 1, lambda: None)
     monkeypatch.setattr(expert, "drive", lambda *_, **options: (WHOLE, True))
-    assert generation.demonstrations("merge", 1, 0, 1, lambda: None).provenance["rejected"] == 0
+    assert expert.demonstrations("merge", 1, 0, 1, lambda: None).provenance["rejected"] == 0
 
 
 @pytest.mark.parametrize(("name", "seconds"), [("merge", 1.0), ("intersection", 0.5)])
 def test_after_an_episode_every_vehicle_drives_straight_on(name: str, seconds: float) -> None:
     seen = np.zeros((2, 5, 7), dtype=np.float32)
     seen[-1, :2] = (1, 10, 20, 4, -2, 1, 0)
-    longer = generation.driven_on(seen, name, 5)
+    longer = expert.driven_on(seen, name, 5)
     assert np.array_equal(longer[:2], seen)
     assert longer[2:, 1, 1].tolist() == [10 + 4 * seconds * k for k in (1, 2, 3)]
     assert longer[2:, 0, 2].tolist() == [20 - 2 * seconds * k for k in (1, 2, 3)]

@@ -12,8 +12,7 @@ from ftl_lightning import FewShot
 from ftl_lightning.data.features import Observed
 from ftl_lightning.domains.driving import expert
 from ftl_lightning.domains.driving.domain import DOMAIN
-from ftl_lightning.domains.driving.shipped import training_set
-from ftl_lightning.domains.driving.traffic import STATE, TRAFFIC, decision_seconds
+from ftl_lightning.domains.driving.traffic import STATE, TRAFFIC, decision_seconds, training_set
 from ftl_lightning.evaluation.closed_loop import PlanFollower
 from ftl_lightning.services.seeding import EVALUATION_SEED
 from tests.conftest import ROOT

@@ -11,12 +11,10 @@ import pytest
 import torch
 
 from ftl_lightning.data.demonstrations import Demonstrations
-from ftl_lightning.domains.driving.domain import DOMAIN
+from ftl_lightning.domains.driving.domain import DOMAIN, POLICIES
 from ftl_lightning.domains.driving.expert import SEARCH
 from ftl_lightning.domains.driving.foresight import VETOES, Foresight
-from ftl_lightning.domains.driving.policies import POLICIES
-from ftl_lightning.domains.driving.shipped import training_set
-from ftl_lightning.domains.driving.traffic import BELIEF, SCENARIO, STATE, TRAFFIC, origin
+from ftl_lightning.domains.driving.traffic import BELIEF, SCENARIO, STATE, TRAFFIC, origin, training_set
 from ftl_lightning.domains.driving.views import VIEWS
 from ftl_lightning.evaluation.closed_loop import planner
 from ftl_lightning.evaluation.evaluator import Evaluator

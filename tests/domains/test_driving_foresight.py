@@ -9,8 +9,7 @@ import pytest
 from ftl_lightning.domains.driving.environment import DrivingEnvironment
 from ftl_lightning.domains.driving.expert import BLIND, Blind, plan_blind
 from ftl_lightning.domains.driving.foresight import FRAMES, VETOES, Beliefs, Foresight, Worlds
-from ftl_lightning.domains.driving.scenarios import EXITS, SCENARIOS, make
-from ftl_lightning.domains.driving.simulation import save
+from ftl_lightning.domains.driving.scenarios import EXITS, SCENARIOS, make, save
 from ftl_lightning.domains.driving.traffic import BELIEF, SIMULATION, STEP
 
 
@@ -149,7 +148,7 @@ def test_an_episode_repeats(veto: str) -> None:
     for _ in range(2):
         env = DrivingEnvironment(veto)
         env.reset(seed=5, options={"task": "roundabout"})
-        faster = np.array([env._env.action_type.actions_indexes["FASTER"]], dtype=np.float32)
+        faster = np.array([env.simulation.action_type.actions_indexes["FASTER"]], dtype=np.float32)
         ways.append([env.step(faster)[0]["traffic"].tolist() for _ in range(2)])
     assert ways[0] == ways[1]
 

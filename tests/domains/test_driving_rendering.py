@@ -8,8 +8,7 @@ from matplotlib.figure import Figure
 
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.driving.rendering import film, render
-from ftl_lightning.domains.driving.shipped import SHIPPED
-from ftl_lightning.domains.driving.traffic import TRAFFIC
+from ftl_lightning.domains.driving.traffic import SHIPPED, TRAFFIC
 from ftl_lightning.domains.execution import Rollout
 
 EXIT = Demonstrations.load(SHIPPED / "exit.safetensors").rows([0])

@@ -10,9 +10,8 @@ from torch import Tensor
 from ftl_lightning.data.features import Observed
 from ftl_lightning.domains.domain import View
 from ftl_lightning.domains.driving.domain import DOMAIN
-from ftl_lightning.domains.driving.motion import drive
 from ftl_lightning.domains.driving.traffic import SCENARIO, TRAFFIC, initial_states
-from ftl_lightning.domains.driving.views import VIEWS
+from ftl_lightning.domains.driving.views import VIEWS, drive
 
 
 def vehicle(x: float, y: float, speed: float, heading: float) -> list[float]:

@@ -11,8 +11,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from ftl_lightning import FewShot
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.mocap.measures import bone_error
-from ftl_lightning.domains.mocap.skeleton import GROUPS, HORIZON
-from ftl_lightning.domains.mocap.source import POSE, Recorded
+from ftl_lightning.domains.mocap.skeleton import GROUPS, HORIZON, POSE
+from ftl_lightning.domains.mocap.source import Recorded
 from ftl_lightning.evaluation.results import read_rows
 from tests.conftest import CONF, ROOT, succeed
 from tests.domains.mocap_samples import folder

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from ftl_lightning.data.demonstrations import Demonstrations
-from ftl_lightning.domains.mocap.recordings import FILE
 from ftl_lightning.domains.mocap.skeleton import HORIZON
+from ftl_lightning.domains.mocap.source import FILE
 from ftl_lightning.few_shot.learner import FewShot
 from tests.conftest import ROOT
 from tests.domains.mocap_samples import motion, recordings, script

@@ -8,13 +8,22 @@ from torch import Tensor
 
 from ftl_lightning.domains.mocap import judge as judging
 from ftl_lightning.domains.mocap import skeleton
-from ftl_lightning.domains.mocap.actions import CLASSES, OTHER, TESTED, action, actions, judged
 from ftl_lightning.domains.mocap.features import JOINTS, LOWER, UPPER, bones, extremes, places, signals, summary, turns
 from ftl_lightning.domains.mocap.judge import ARMS, LEGS, PARTS, PATH, WHOLE, Judge, identity, shipped_judge
-from ftl_lightning.domains.mocap.recordings import FILE
-from ftl_lightning.domains.mocap.skeleton import HORIZON, L_ANKLE, L_ELBOW, L_WRIST, R_ANKLE, R_ELBOW, R_WRIST, as_joints, mirrored
-from ftl_lightning.domains.mocap.standing import standing_poses
-from ftl_lightning.domains.mocap.tasks import ACTION_OF, AND, TRAINING_CONCEPTS
+from ftl_lightning.domains.mocap.skeleton import (
+    HORIZON,
+    L_ANKLE,
+    L_ELBOW,
+    L_WRIST,
+    R_ANKLE,
+    R_ELBOW,
+    R_WRIST,
+    as_joints,
+    mirrored,
+    standing_poses,
+)
+from ftl_lightning.domains.mocap.source import FILE
+from ftl_lightning.domains.mocap.tasks import ACTION_OF, AND, CLASSES, OTHER, TESTED, TRAINING_CONCEPTS, action, actions, judged
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.shipped import shipped
 from ftl_lightning.services.tensor_file import save_tensors

@@ -1,14 +1,160 @@
+import math
+
 import pytest
 import torch
 from torch import Tensor
 
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.mocap import measures
+from ftl_lightning.domains.mocap.domain import BLENDED, DOMAIN, VIEWS, begun_elsewhere, smoothed, with_rigid_bones
 from ftl_lightning.domains.mocap.judge import Judge
-from ftl_lightning.domains.mocap.measures import MEASURES, POSE, bone_error, distances, diversity, jerk, learned_elsewhere, rise
-from ftl_lightning.domains.mocap.skeleton import FPS, HORIZON, L_WRIST, R_WRIST, as_joints
-from ftl_lightning.domains.mocap.standing import standing_poses
+from ftl_lightning.domains.mocap.measures import RULES, bone_error, distances, diversity, jerk, learned_elsewhere, rise
+from ftl_lightning.domains.mocap.skeleton import (
+    FPS,
+    HORIZON,
+    L_ANKLE,
+    L_KNEE,
+    L_WRIST,
+    POSE,
+    R_ANKLE,
+    R_KNEE,
+    R_WRIST,
+    as_joints,
+    drawn_poses,
+    standing_poses,
+    walking_poses,
+)
 from ftl_lightning.services.errors import UserError
+
+TIME = torch.linspace(0, 1, HORIZON)
+PHASE = (1 - torch.cos(2 * math.pi * TIME)) / 2
+"""From 0 to 1 and back within a window."""
+
+
+def person() -> Tensor:
+    """A window ``(1, 32, 42)`` of somebody who stands still."""
+    return standing_poses(1, torch.Generator().manual_seed(0))[:, None].repeat(1, HORIZON, 1)
+
+
+def jack(hands: float = 1.0, feet: float = 1.0, late: int = 0) -> Tensor:
+    """Hands that go overhead and down, feet that open and close, by shares of the usual size; feet some frames later."""
+    states = person()
+    joints = as_joints(states)
+    for wrist, side in ((R_WRIST, 1), (L_WRIST, -1)):
+        joints[0, :, wrist, 2] += hands * 0.9 * PHASE
+        joints[0, :, wrist, 0] += side * 0.3 * (PHASE * (1 - PHASE))
+    for ankle, side in ((R_ANKLE, 1), (L_ANKLE, -1)):
+        joints[0, :, ankle, 0] += side * feet * 0.2 * PHASE.roll(late)
+    return states
+
+
+def circle(turns: float = 1.0, narrow: float = 1.0) -> Tensor:
+    """Arms held sideways that turn, on a path that is round or, with 0, a line."""
+    states = person()
+    joints = as_joints(states)
+    angle = 2 * math.pi * turns * TIME
+    for wrist, shoulder, side in ((R_WRIST, 6, 1), (L_WRIST, 9, -1)):
+        joints[0, :, wrist] = joints[0, :, shoulder] + torch.stack(
+            [torch.full_like(TIME, side * 0.5), narrow * 0.2 * torch.sin(angle), 0.2 * torch.cos(angle)], dim=-1
+        )
+    return states
+
+
+def test_a_jumping_jack_needs_hands_and_feet_in_time() -> None:
+    rule = RULES["jumping jacks"]
+    assert rule(jack()).tolist() == [True]
+    assert rule(jack(hands=0.4)).tolist() == [False], "hands that stay below the head"
+    assert rule(jack(feet=0.2)).tolist() == [False], "feet that hardly open"
+    assert rule(jack(feet=0)).tolist() == [False]
+    assert rule(jack(late=HORIZON // 4)).tolist() == [False], "feet a quarter of a cycle later"
+    assert rule(jack(late=HORIZON // 2)).tolist() == [True], "some open their feet while the hands sink"
+    one = jack()
+    as_joints(one)[:, :, L_WRIST] = as_joints(person())[:, :, L_WRIST]
+    assert rule(one).tolist() == [False], "one hand"
+    lying = jack()[..., [*range(42)]].clone()
+    as_joints(lying)[..., 2] *= 0.3
+    assert rule(lying).tolist() == [False], "nobody upright"
+    trembling = jack() + 0.03 * torch.randn(1, HORIZON, 42, generator=torch.Generator().manual_seed(0))
+    assert rule(trembling).tolist() == [False]
+
+
+def test_an_arm_circle_needs_a_turn_on_a_round_path() -> None:
+    rule = RULES["arm circle"]
+    assert rule(circle()).tolist() == [True]
+    assert rule(circle(turns=-1)).tolist() == [True], "the other way round"
+    assert rule(circle(turns=0.5)).tolist() == [False]
+    assert rule(circle(narrow=0)).tolist() == [False], "up and down"
+    assert rule(person()).tolist() == [False]
+    assert measures.arm_rotation(circle()).mean().item() == pytest.approx(360, abs=10)
+    raised = person()
+    as_joints(raised)[0, :, [R_WRIST, L_WRIST], 2] += TIME[:, None]
+    assert rule(raised).tolist() == [False], "arms that are raised without a turn"
+
+
+def test_knees_are_raised_one_at_a_time_and_bent_together_in_a_squat() -> None:
+    raised = person()
+    as_joints(raised)[0, :, R_KNEE, 2] += 0.35 * PHASE
+    assert RULES["knee raise"](raised).tolist() == [True]
+    assert RULES["knee raise"](person()).tolist() == [False]
+    squatting = person()
+    joints = as_joints(squatting)
+    joints[0, :, [R_KNEE, L_KNEE], 1] += 0.35 * PHASE[:, None]
+    joints[0, :, [R_KNEE, L_KNEE], 2] += 0.2 * PHASE[:, None]
+    joints[0, :, [R_ANKLE, L_ANKLE], 2] += 0.4 * PHASE[:, None]
+    assert RULES["squat"](squatting).tolist() == [True]
+    assert RULES["knee raise"](squatting).tolist() == [False]
+    assert RULES["squat"](person()).tolist() == [False]
+
+
+def test_level_starts_and_strides_are_counted_apart_and_nothing_is_said_of_other_goals() -> None:
+    states = torch.cat([jack(), jack(feet=0)])
+    starts = InitialStates({POSE: states[:, 0].clone()})
+    as_joints(starts.observed[POSE])[1, R_ANKLE, 1] += 0.5
+    assert measures.rule("jumping jacks", states, starts).tolist() == [1, 0]
+    assert measures.level("jumping jacks", states, starts).nan_to_num(-1).tolist() == [1, -1]
+    assert measures.strides("jumping jacks", states, starts).nan_to_num(-1).tolist() == [-1, 0]
+    for name in ("rule", "level", "strides", "feet in time", "degrees turned"):
+        assert DOMAIN.measure("walk", states, starts)[name].isnan().all(), name
+    assert DOMAIN.measure("jumping jacks", states, starts)["amplitude of feet"][0] == pytest.approx(0.4, abs=0.01)
+
+
+def test_half_of_the_windows_begin_elsewhere_and_go_on_as_recorded() -> None:
+    states = jack().repeat(200, 1, 1)
+    observed = {POSE: states[:, 0]}
+    same, seen = begun_elsewhere(states, observed, None)
+    assert same is states
+    assert seen is observed
+    begun, seen = begun_elsewhere(states, observed, torch.Generator().manual_seed(0))
+    elsewhere = (begun[:, 0] != states[:, 0]).any(dim=1)
+    assert 70 < elsewhere.sum() < 130
+    assert torch.equal(begun[~elsewhere], states[~elsewhere])
+    assert torch.equal(begun[:, BLENDED[1] :], states[:, BLENDED[1] :])
+    assert torch.equal(seen[POSE], begun[:, 0]), "the model observes where the window begins"
+    rigid = with_rigid_bones(begun, observed)  # bones are those of the person
+    assert torch.allclose(rigid[elsewhere, : BLENDED[0]], begun[elsewhere, : BLENDED[0]], atol=1e-5)
+    again, _ = begun_elsewhere(states, observed, torch.Generator().manual_seed(0))
+    assert torch.equal(again, begun)
+    assert VIEWS["smooth"].perturb is begun_elsewhere
+
+
+def test_poses_are_drawn_of_people_who_stand_and_walk() -> None:
+    poses = drawn_poses(500, torch.Generator().manual_seed(0))
+    assert poses.shape == (500, 42)
+    assert 0.3 < measures.is_stride(poses).float().mean() < 0.8
+    assert not measures.is_stride(standing_poses(20, torch.Generator().manual_seed(0))).any()
+    assert measures.is_stride(walking_poses(500, torch.Generator().manual_seed(0))).any()
+
+
+def test_smoothing_removes_trembling_and_keeps_the_ends() -> None:
+    states = jack()
+    observed = {POSE: states[:, 0]}
+    trembling = states + 0.003 * torch.randn(states.shape, generator=torch.Generator().manual_seed(0))
+    trembling[:, 0] = states[:, 0]
+    smooth = smoothed(trembling, observed)
+    assert measures.jerk("jumping jacks", smooth, None) < 0.5 * measures.jerk("jumping jacks", trembling, None)
+    assert torch.allclose(smooth[:, 0], states[:, 0], atol=1e-6)
+    rigid = with_rigid_bones(states, observed)
+    assert (smoothed(rigid, observed) - rigid).abs().max() < 0.02, "metres by which a second of motion is changed at most"
 
 
 def people(count: int, seed: int = 0) -> Tensor:
@@ -36,8 +182,8 @@ def test_bones_of_the_start_have_no_error_longer_ones_their_share_and_each_windo
     assert bone_error("walk", states, starts).abs().max() < 1e-6
     assert torch.allclose(bone_error("walk", 1.1 * states, starts), torch.full((3,), 0.1), atol=1e-5)
     assert bone_error("walk", 1.1 * states, None).abs().max() < 1e-6, "without a start, the first frame's lengths are right"
-    for name, measure in MEASURES.items():
-        assert measure("walk", states, None).shape == (3,), name
+    for name, metric in DOMAIN.metrics.items():
+        assert metric.measure("walk", states, None).shape == (3,), name
 
 
 def test_jerk_is_the_size_of_the_third_derivative() -> None:

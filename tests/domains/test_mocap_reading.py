@@ -11,12 +11,10 @@ from numpy.typing import NDArray
 
 from ftl_lightning.domains.mocap.asf_amc import INCH, JOINT_BONES, read_amc, read_asf
 from ftl_lightning.domains.mocap.bvh import METRES, NODES, read_bvh
-from ftl_lightning.domains.mocap.normalise import normalised, z_up
 from ftl_lightning.domains.mocap.prepare import LEFT_OUT, REPORT, prepare
-from ftl_lightning.domains.mocap.recordings import FILE, Recordings, read_folder
-from ftl_lightning.domains.mocap.segments import SEGMENTS, read_segments, shipped_segments
-from ftl_lightning.domains.mocap.skeleton import JOINTS
-from ftl_lightning.domains.mocap.source import Recorded
+from ftl_lightning.domains.mocap.skeleton import JOINTS, normalised, z_up
+from ftl_lightning.domains.mocap.source import FILE, Recorded, Recordings, read_folder
+from ftl_lightning.domains.mocap.tasks import SEGMENTS, SHIPPED, read_segments
 from ftl_lightning.services.errors import UserError
 from tests.conftest import refused, succeed
 from tests.domains.mocap_samples import BONES, amc, asf, database, motion, named_recordings, recordings, swing
@@ -147,7 +145,7 @@ def test_what_was_dropped_is_told_with_its_reason(tmp_path: Path) -> None:
     assert "     1  description that is no training concept: 02_03 (juggling)\n" in text
     assert "     1  no description in the index: 02_04\n" in text
     assert "     1  shorter than 128 frames: 02_05 (100 frames)\n" in text
-    assert "02_06.amc: line 15: expected numbers, found 'lradius zero'" in text
+    assert "02_06.amc: line 15: expected a finite number, found 'zero'" in text
     assert "     1  less than 32 frames without glitches: 02_07 (of 40)\n" in text
     assert "     1  no skeleton of the subject: 05_08 (05.asf)\n" in text
     assert "     1  file not named after a trial, such as 13_29.amc: readme.amc\n" in text
@@ -222,16 +220,16 @@ ONCE = "expected a frame's number before its bones, and each bone once"
     [
         (MOTION, "lradius", "tail", "02_01.amc: line 15: expected a bone of the skeleton, found 'tail'; is it of another subject?"),
         (MOTION, "lfemur 0 0 0", "lfemur 0 0", "02_01.amc: line 6: expected 3 numbers for 'lfemur', found 'lfemur 0 0'"),
-        (MOTION, "lfemur 0 0 0", "lfemur 0 x 0", "02_01.amc: line 6: expected numbers, found 'lfemur 0 x 0'"),
-        (MOTION, "lfemur 0 0 0", "lfemur 0 nan 0", "02_01.amc: frame 1: expected finite numbers of 'lfemur', found others"),
+        (MOTION, "lfemur 0 0 0", "lfemur 0 x 0", "02_01.amc: line 6: expected 3 finite numbers, found '0 x 0'"),
+        (MOTION, "lfemur 0 0 0", "lfemur 0 nan 0", "02_01.amc: line 6: expected 3 finite numbers, found '0 nan 0'"),
         (MOTION, "lfemur 0 0 0\n", "", f"02_01.amc: line 20: {ONCE}"),
         (MOTION, "ltibia 0\n", "ltibia 0\nltibia 0\n", f"02_01.amc: line 8: {ONCE}"),
-        (SKELETON, "name head", "name skull", "02.asf: expected a skeleton of the CMU database, found one without the bone 'head'"),
-        (SKELETON, "length 7.0", "length long", "02.asf: line 20: expected numbers, found 'long'"),
+        (SKELETON, "name head", "name skull", "expected a skeleton of the CMU database, found a skeleton without the bone 'head'"),
+        (SKELETON, "length 7.0", "length long", "02.asf: line 20: expected a finite number, found 'long'"),
         (SKELETON, "direction 1 -1 0", "direction 1 -1", "expected 3 finite numbers, found '1 -1'"),
         (SKELETON, "    direction 1 -1 0\n", "", "expected a bone with name, direction, length and axis (no 'direction' here)"),
         (SKELETON, "order TX TY TZ RX RY RZ", "order TX TY", "02.asf: line 6: expected TX TY TZ RX RY RZ in some order"),
-        (SKELETON, "    thorax lowerneck", "", "section ':hierarchy': expected what 'lowerneck' hangs on, up to the root"),
+        (SKELETON, "    thorax lowerneck", "", "section ':hierarchy': expected the parents of 'lowerneck', up to the root"),
         (SKELETON, "axis 0 0 20 XYZ", "axis 0 0 20 XXZ", "expected an order of axes such as XYZ, found 'XXZ'"),
         (SKELETON, "length 0.45", "length 0", "02.asf: key 'length': expected a positive number, found 0"),
         (MOTION, None, ":FULLY-SPECIFIED\n:DEGREES\n", "02_01.amc: expected frames of motion, found none"),
@@ -259,8 +257,8 @@ def test_segments_of_ones_own_come_along_with_the_shipped_ones_that_show_the_new
     _, segments = read_folder(tmp_path / "out")
     assert [(one.label, one.start, one.stop) for one in segments if one.trial_id == "02_01"] == [("arm circle", 3, 39)]
     assert "chop wood" in {one.label for one in segments}
-    assert sum(one.label == "jumping jacks" and one.trial_id.startswith("13") for one in shipped_segments()) == 3
-    assert all(one.stop is None or one.stop > one.start for one in shipped_segments())
+    assert sum(one.label == "jumping jacks" and one.trial_id.startswith("13") for one in read_segments(SHIPPED)) == 3
+    assert all(one.stop is None or one.stop > one.start for one in read_segments(SHIPPED))
     with pytest.raises(UserError, match="expected a table of segments"):
         read_segments(Path("nowhere.csv"))
 

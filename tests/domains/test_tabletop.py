@@ -12,15 +12,25 @@ import torch
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.execution import Rollout
-from ftl_lightning.domains.tabletop import DOMAIN, WIDE, experts, source, tasks
+from ftl_lightning.domains.tabletop import DOMAIN, WIDE, experts, interface, source
 from ftl_lightning.domains.tabletop import scenes as layout
-from ftl_lightning.domains.tabletop.domain import act
-from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
-from ftl_lightning.domains.tabletop.interface import ACTION, FEATURES, IMAGE, POSE
-from ftl_lightning.domains.tabletop.pushing import Manner, around, pushed
+from ftl_lightning.domains.tabletop.domain import act, judge
+from ftl_lightning.domains.tabletop.environment import TableTopEnvironment, judged
+from ftl_lightning.domains.tabletop.experts import Manner, around, pushed
+from ftl_lightning.domains.tabletop.interface import (
+    ACTION,
+    AROUND_BOWL,
+    FEATURES,
+    IMAGE,
+    POSE,
+    PUSH,
+    PUSH_ON_BOOK,
+    PUSH_TO_BOWL,
+    TASKS,
+    TO_BOOK,
+    TO_WHITE,
+)
 from ftl_lightning.domains.tabletop.scenes import BOOK, BOWL, CIRCLE, TRIANGLE, WHITE, gap, outline, scene_of, scenes, within
-from ftl_lightning.domains.tabletop.success import judge, judged
-from ftl_lightning.domains.tabletop.tasks import AROUND_BOWL, PUSH, PUSH_ON_BOOK, PUSH_TO_BOWL, TASKS, TO_BOOK, TO_WHITE
 from ftl_lightning.domains.tabletop.world import COLOUR
 from ftl_lightning.evaluation.closed_loop import PlanFollower, fixed_plans, roll_out
 from ftl_lightning.networks.text_encoder import load_encoder
@@ -162,8 +172,8 @@ JUDGED = [
     (TO_BOOK, _told((0.5, 0.1, 0.045), lifted=False), False),
     (TO_WHITE, _told((0.65, -0.15, 0.075)), True),
     (TO_WHITE, _told((0.68, -0.15, 0.075)), False),
-    (tasks.BESIDE_BOWL, _told((0.55, -0.2, 0.015)), True),
-    (tasks.BESIDE_BOWL, _told((0.61, -0.2, 0.015)), False),
+    (interface.BESIDE_BOWL, _told((0.55, -0.2, 0.015)), True),
+    (interface.BESIDE_BOWL, _told((0.61, -0.2, 0.015)), False),
     (PUSH, _told((0.55, 0, 0.015), touched=True), True),
     (PUSH, _told((0.55, 0, 0.015)), False),
     (PUSH, _told((0.55, 0, 0.045), touched=True), False),
@@ -192,7 +202,7 @@ SOME = [PUSH, *(pytest.param(task, marks=pytest.mark.slow) for task in TASKS if 
 @pytest.mark.parametrize("task", SOME)
 def test_experts_succeed(task: str, env: TableTopEnvironment) -> None:
     scene = scenes(task, 1, 11)[0].numpy()
-    episode = experts.perform(env, task, scene, np.random.default_rng(0))
+    episode = source.perform(env, task, scene, np.random.default_rng(0))
     assert episode.success
     assert episode.commands[0].tolist() == pytest.approx([*scene[layout.HAND][:3], 0.08])
     assert np.linalg.norm(np.diff(episode.commands[:, :3], axis=0), axis=-1).max() < 0.0201
@@ -203,7 +213,7 @@ def test_experts_succeed(task: str, env: TableTopEnvironment) -> None:
 @pytest.mark.slow
 def test_pushing_at_the_height_of_the_table_moves_the_book(env: TableTopEnvironment) -> None:
     scene = scenes(PUSH_ON_BOOK, 1, 1)[0].numpy()
-    assert not experts.perform(env, PUSH_ON_BOOK, scene, np.random.default_rng(0), height=experts.PUSH_HEIGHT).success
+    assert not source.perform(env, PUSH_ON_BOOK, scene, np.random.default_rng(0), height=experts.PUSH_HEIGHT).success
     assert env._told()["book"] > 0.02
 
 
@@ -220,7 +230,7 @@ def test_tasks_begin_anew_wherever_hand_and_circle_are(task: str, env: TableTopE
         assert circle[2] == pytest.approx(before[2], abs=1e-3)
         sides.append(hand - circle[:2])
         if not number:
-            assert experts.perform(env, task, scene, np.random.default_rng([2, number]), begin=experts.led_astray).success
+            assert source.perform(env, task, scene, np.random.default_rng([2, number]), begin=experts.led_astray).success
     assert np.ptp(sides, axis=0).min() > 0.03
 
 
@@ -263,7 +273,7 @@ def test_the_way_around_the_bowl_keeps_its_distance_and_ends_at_the_goal() -> No
 def test_distractors_lie_elsewhere_in_each_picture_and_nothing_else_changes(env: TableTopEnvironment) -> None:
     scene = scene_of({**APART, BOOK: (0.4, -0.2, 0.0), BOWL: (0.62, 0.2, 0.0)})
     plain, scattered, again = (
-        experts.perform(env, PUSH, scene, np.random.default_rng(3), scatter=scatter) for scatter in (False, True, True)
+        source.perform(env, PUSH, scene, np.random.default_rng(3), scatter=scatter) for scatter in (False, True, True)
     )
     assert (plain.commands == scattered.commands).all()
     assert (plain.poses == scattered.poses).all()
@@ -287,7 +297,7 @@ def test_distractors_lie_elsewhere_in_each_picture_and_nothing_else_changes(env:
 def test_training_sets_are_scattered_and_demonstrations_of_a_task_are_not(monkeypatch: pytest.MonkeyPatch) -> None:
     drawn = []
     expert, still, images = DOMAIN.source(None), np.zeros((2, 12), np.float32), np.zeros((2, *FEATURES[IMAGE].shape), np.uint8)
-    nothing = experts.Episode(still[:, :4], still[1:, :4], images, still[:, 4:], success=True)
+    nothing = source.Episode(still[:, :4], still[1:, :4], images, still[:, 4:], success=True)
     made = source.joined_episodes(PUSH_ON_BOOK, [nothing], None, {})
     monkeypatch.setattr(source, "cached", lambda settings, *_: drawn.append(settings) or made)
     expert.split("train", 2, 0)
@@ -306,7 +316,7 @@ def test_training_sets_are_scattered_and_demonstrations_of_a_task_are_not(monkey
 def test_scattered_pictures_tell_what_is_where_and_the_triangle_lies_on_all_surfaces(env: TableTopEnvironment) -> None:
     around_it = {BOOK: (0.58, -0.15, 0.0), WHITE: (0.6, 0.15, 0.0), BOWL: (0.42, 0.2, 0.0), TRIANGLE: (0.42, 0.08, 0)}
     placed = {CIRCLE: (0.4, -0.1, 0.0), **around_it}
-    made = experts.perform(env, TO_BOOK, scene_of(placed), np.random.default_rng(0), scatter=True)
+    made = source.perform(env, TO_BOOK, scene_of(placed), np.random.default_rng(0), scatter=True)
     assert made.places is not None
     assert made.places.shape == (len(made.images), 5, 4)
     seen, x, y, z = torch.from_numpy(made.places).unbind(dim=-1)
@@ -371,7 +381,7 @@ def test_reference_lines() -> None:
 def test_an_experts_actions_come_to_the_same_in_another_simulation(env: TableTopEnvironment) -> None:
     other = TableTopEnvironment()
     scene = scenes(AROUND_BOWL, 1, 3)[0].numpy()  # long, and the hand slips farther than it can go
-    episode = experts.perform(other, AROUND_BOWL, scene, np.random.default_rng([0, 0]))
+    episode = source.perform(other, AROUND_BOWL, scene, np.random.default_rng([0, 0]))
     env.reset(options={"scene": scene})
     told = [env.step(action)[-1] for action in episode.actions][-1]
     assert judged(AROUND_BOWL, scene, told) == episode.success

@@ -14,12 +14,24 @@ import torch
 from ftl_lightning.cli.main import main
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import InitialStates
-from ftl_lightning.domains.tabletop import DOMAIN, policies, source
+from ftl_lightning.domains.tabletop import DOMAIN, source
+from ftl_lightning.domains.tabletop.domain import POLICIES
 from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
-from ftl_lightning.domains.tabletop.experts import Episode
-from ftl_lightning.domains.tabletop.interface import FEATURES, IMAGE, NAME, OPEN, POSE, STATE_NAMES, STATE_UNITS
+from ftl_lightning.domains.tabletop.interface import (
+    FEATURES,
+    IMAGE,
+    NAME,
+    OPEN,
+    POSE,
+    PUSH,
+    PUSH_ON_BOOK,
+    STATE_NAMES,
+    STATE_UNITS,
+    TASKS,
+    TRAINING_CONCEPTS,
+)
 from ftl_lightning.domains.tabletop.scenes import CIRCLE, HAND, TRIANGLE, scene_of
-from ftl_lightning.domains.tabletop.tasks import PUSH, PUSH_ON_BOOK, TASKS, TRAINING_CONCEPTS
+from ftl_lightning.domains.tabletop.source import Episode
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.evaluation import generation
 from ftl_lightning.evaluation.closed_loop import fixed_plans, reset, roll_out
@@ -252,22 +264,22 @@ def test_what_the_machine_lacks_stops_everything(error: BaseException, monkeypat
     with pytest.raises(type(error)):
         source.Expert().draw(PUSH_ON_BOOK, 2, 0)
     assert not list(Path.cwd().rglob("*.safetensors"))  # neither here nor in the cache
-    monkeypatch.setattr(policies, "perform", performed(error))
+    monkeypatch.setattr(source, "perform", performed(error))
     with pytest.raises(type(error)):
-        policies.POLICIES["expert (oracle)"](PUSH, starts(), None, 0)
+        POLICIES["expert (oracle)"](PUSH, starts(), None, 0)
 
 
 def test_an_oracle_that_breaks_has_no_action_there_and_the_others_go_on(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(policies, "perform", performed(RuntimeError("broke")))
+    monkeypatch.setattr(source, "perform", performed(RuntimeError("broke")))
     three = starts()
-    policy = policies.POLICIES["expert (oracle)"](PUSH, three, None, 0)
+    policy = POLICIES["expert (oracle)"](PUSH, three, None, 0)
     assert policy is not None
     actions = policy(three.observed, [0, 1, 2], 1)
     assert actions[1].isnan().all()  # the episode counts as failed
     assert torch.equal(actions[[0, 2]], torch.zeros(2, 4))
-    assert "episode 1: RuntimeError('broke'); the reference line has no action there" in caplog.text
+    assert "episode 1: RuntimeError('broke'); the reference policy has no action there" in caplog.text
 
 
 def test_files_of_pictures_are_a_tenth_as_large_as_the_pictures_and_the_cache_holds_them() -> None:

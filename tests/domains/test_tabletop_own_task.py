@@ -6,8 +6,7 @@ from typing import Any
 import pytest
 
 from ftl_lightning.domains.tabletop import DOMAIN
-from ftl_lightning.domains.tabletop.interface import IMAGE, POSE
-from ftl_lightning.domains.tabletop.tasks import PUSH_TO_WHITE
+from ftl_lightning.domains.tabletop.interface import IMAGE, POSE, PUSH_TO_WHITE
 from ftl_lightning.few_shot.learner import FewShot
 from tests.conftest import ROOT
 

@@ -12,9 +12,22 @@ import torch
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import Observed
 from ftl_lightning.domains.tabletop import source
-from ftl_lightning.domains.tabletop.interface import IMAGE, NAME, PLACES, POSE
-from ftl_lightning.domains.tabletop.tasks import AROUND_BOWL, PUSH, PUSH_ON_BOOK
-from ftl_lightning.domains.tabletop.views import BLUR, HALF, MIDDLE, RAISED, VIEWS, misplaced, told
+from ftl_lightning.domains.tabletop.interface import (
+    AROUND_BOWL,
+    BLUR,
+    HALF,
+    IMAGE,
+    MIDDLE,
+    NAME,
+    PLACES,
+    POSE,
+    PUSH,
+    PUSH_ON_BOOK,
+    RAISED,
+    VIEWS,
+    misplaced,
+    told,
+)
 from ftl_lightning.methods.ftl_igm.pretraining import PretrainingModule
 from ftl_lightning.networks.image_encoder import ImageEncoders
 from ftl_lightning.services.errors import UserError

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from ftl_lightning.data.demonstrations import Demonstrations
-from ftl_lightning.domains.driving.shipped import SHIPPED
+from ftl_lightning.domains.driving.traffic import SHIPPED
 from ftl_lightning.domains.films import Shape, VectorFilm, Wireframe, still
 from ftl_lightning.domains.registry import domain_names, load_domain
 from ftl_lightning.evaluation.closed_loop import PlanFollower, fixed_plans, roll_out

@@ -11,7 +11,7 @@ import argparse
 from pathlib import Path
 
 from ftl_lightning.domains.driving.domain import Expert
-from ftl_lightning.domains.driving.tasks import TRAINING_CONCEPTS
+from ftl_lightning.domains.driving.traffic import TRAINING_CONCEPTS
 
 
 def main() -> None:

@@ -27,13 +27,12 @@ from ftl_lightning import FewShot
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.driving import expert
-from ftl_lightning.domains.driving.domain import DOMAIN, Expert
+from ftl_lightning.domains.driving.domain import DOMAIN, POLICIES, Expert
 from ftl_lightning.domains.driving.environment import DrivingEnvironment
 from ftl_lightning.domains.driving.foresight import VETOES, Beliefs, meaning
-from ftl_lightning.domains.driving.motion import speed
-from ftl_lightning.domains.driving.policies import POLICIES
-from ftl_lightning.domains.driving.simulation import advance
+from ftl_lightning.domains.driving.scenarios import advance
 from ftl_lightning.domains.driving.traffic import MAX_STEPS, STATE, STEP, TRAFFIC, decision_seconds
+from ftl_lightning.domains.driving.views import speed
 from ftl_lightning.domains.execution import Policy
 from ftl_lightning.evaluation.closed_loop import PlanFollower, planner, sampled_plans
 from ftl_lightning.igm.composition import Composition

@@ -18,8 +18,7 @@ from highway_env.envs.common.abstract import AbstractEnv
 from rich.progress import track
 
 from ftl_lightning.domains.driving import expert
-from ftl_lightning.domains.driving.scenarios import SCENARIOS, make
-from ftl_lightning.domains.driving.simulation import advance, restore, save
+from ftl_lightning.domains.driving.scenarios import SCENARIOS, advance, make, restore, save
 from ftl_lightning.services.tensor_file import write_text
 
 REPEATS = 20

@@ -1,5 +1,7 @@
-"""Domain object of driving."""
+"""Domain object of driving, and its baseline policies."""
 
+import itertools
+from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -10,15 +12,10 @@ from torch import Tensor
 
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.distances import path_distance
-from ftl_lightning.data.features import InitialStates
+from ftl_lightning.data.features import InitialStates, Observed
 from ftl_lightning.data.formats.files import cached
 from ftl_lightning.domains.comparison import Comparison, Paper
 from ftl_lightning.domains.domain import Concepts, Domain, Plans, Split, deferred
-from ftl_lightning.domains.driving import policies
-from ftl_lightning.domains.driving.motion import turned
-from ftl_lightning.domains.driving.published import PUBLISHED
-from ftl_lightning.domains.driving.shipped import training_set
-from ftl_lightning.domains.driving.tasks import SUITES, TRAINING_CONCEPTS
 from ftl_lightning.domains.driving.traffic import (
     BELIEF,
     FEATURES_SEEN,
@@ -26,28 +23,156 @@ from ftl_lightning.domains.driving.traffic import (
     MAX_STEPS,
     NAME,
     NAMES,
+    PUBLISHED,
     SIMULATION,
+    STATE,
     STATE_NAMES,
     STATE_UNITS,
     STEP,
+    SUITES,
+    TRAFFIC,
+    TRAINING_CONCEPTS,
     check_scenario,
     check_simulator,
     episode_seed,
     initial_states,
+    origin,
     scene,
+    training_set,
 )
-from ftl_lightning.domains.driving.views import VIEWS
-from ftl_lightning.domains.execution import ClosedLoop, Rollout
+from ftl_lightning.domains.driving.views import VIEWS, drive, turned
+from ftl_lightning.domains.execution import ClosedLoop, Policy, Rollout
 from ftl_lightning.domains.pictures import Show
+from ftl_lightning.services.seeding import generator
 
 if TYPE_CHECKING:
+    from highway_env.envs.common.abstract import AbstractEnv
+
     from ftl_lightning.domains.driving.environment import DrivingEnvironment
+
+Make = Callable[[str, InitialStates, Demonstrations | None, int], Policy | None]
+SHOWN = 100
+"""Demonstrations per training scenario for the look-up and the regressions."""
+MLP_STEPS = 400
+
+
+def _simulation(goal: str) -> "AbstractEnv":
+    """highway-env's environment of a scenario."""
+    check_simulator()
+    from ftl_lightning.domains.driving.scenarios import make
+
+    return make(goal)
+
+
+def _always(name: str) -> Make:
+    """Constant decision, subject to the planner's veto."""
+
+    def policy(goal: str, starts: InitialStates, demonstrations: Demonstrations | None, seed: int) -> Policy:
+        number = float(_simulation(goal).action_type.actions_indexes[name])
+        return lambda observed, rows, step: torch.full((len(rows), 1), number)
+
+    return policy
+
+
+def _random(goal: str, starts: InitialStates, demonstrations: Demonstrations | None, seed: int) -> Policy:
+    """Uniformly random decisions."""
+    count = int(_simulation(goal).action_space.n)
+    draws = [generator("cpu", seed, row) for row in range(len(starts))]
+    return lambda observed, rows, step: torch.stack([torch.randint(count, (1,), generator=draws[row]).float() for row in rows])
+
+
+def _transitions(goal: str, demonstrations: Demonstrations | None) -> tuple[Observed, Tensor]:
+    """Observations ``(n, *shape)`` by name and next states ``(n, 7)`` of all steps of the demonstrations."""
+    known = training_set("train", SHOWN).select(goal) if demonstrations is None else demonstrations
+    pairs = [(row, time) for row, length in enumerate(known.lengths.tolist()) for time in range(length - 1)]
+    rows, times = torch.tensor(pairs).T
+    return {name: values[rows, times] for name, values in known.observed.items()}, known.states[rows, times + 1]
+
+
+def _nearest(goal: str, starts: InitialStates, demonstrations: Demonstrations | None, seed: int) -> Policy:
+    """Successor of the nearest demonstrated state."""
+    seen, following = _transitions(goal, demonstrations)
+    places = seen[TRAFFIC][:, :STATE]
+    return lambda observed, rows, step: following[torch.cdist(observed[TRAFFIC][:, :STATE], places).argmin(dim=1)]
+
+
+def _regression(fit: Callable[[Tensor, Tensor, torch.Generator], Callable[[Tensor], Tensor]]) -> Make:
+    """Predict drives ``(n, 4)`` from the models' view of the observations.
+
+    Args:
+        fit: ``(inputs (n, 35), drives (n, 4), generator) -> prediction``, both arguments standardised.
+    """
+
+    def policy(goal: str, starts: InitialStates, demonstrations: Demonstrations | None, seed: int) -> Policy:
+        seen, following = _transitions(goal, demonstrations)
+        view = VIEWS["steps"].observe
+        inputs, drives = view(seen)[TRAFFIC], drive(seen[TRAFFIC][:, :STATE], following)
+        middle, spread = inputs.mean(dim=0), inputs.std(dim=0).clamp(min=1e-3)
+        mean, scale = drives.mean(dim=0), drives.std(dim=0).clamp(min=1e-3)
+        predict = fit((inputs - middle) / spread, (drives - mean) / scale, generator("cpu", seed))
+        return lambda observed, rows, step: predict((view(observed)[TRAFFIC] - middle) / spread) * scale + mean
+
+    return policy
+
+
+def _ridge(inputs: Tensor, drives: Tensor, draw: torch.Generator) -> Callable[[Tensor], Tensor]:
+    """Least squares with a penalty of 1 on standardised inputs."""
+    terms = torch.cat((inputs, torch.ones(len(inputs), 1)), dim=1).double()
+    weights = torch.linalg.solve(terms.T @ terms + torch.eye(terms.shape[1], dtype=torch.double), terms.T @ drives.double()).float()
+    return lambda seen: seen @ weights[:-1] + weights[-1]
+
+
+def _mlp(inputs: Tensor, drives: Tensor, draw: torch.Generator) -> Callable[[Tensor], Tensor]:
+    """Two hidden layers of 64, 400 full-batch steps."""
+    layers: list[Tensor] = []
+
+    def predict(seen: Tensor) -> Tensor:
+        for number in range(0, len(layers), 2):
+            seen = seen @ layers[number] + layers[number + 1]
+            seen = torch.nn.functional.silu(seen) if number < len(layers) - 2 else seen
+        return seen
+
+    with torch.inference_mode(False), torch.enable_grad():  # also within evaluation
+        for before, after in itertools.pairwise((inputs.shape[1], 64, 64, drives.shape[1])):
+            weight = torch.randn(before, after, generator=draw) / before**0.5
+            layers += [weight.requires_grad_(), torch.zeros(after, requires_grad=True)]
+        inputs, drives = inputs.clone(), drives.clone()
+        optimizer = torch.optim.AdamW(layers, lr=3e-3, weight_decay=0.1)
+        for _ in range(MLP_STEPS):
+            optimizer.zero_grad()
+            (predict(inputs) - drives).square().mean().backward()
+            optimizer.step()
+    return lambda seen: predict(seen).detach()
+
+
+def _expert(goal: str, starts: InitialStates, demonstrations: Demonstrations | None, seed: int) -> Policy | None:
+    """Next state of the expert; not in training scenarios, where it takes minutes (see the data card for its rates)."""
+    if goal in TRAINING_CONCEPTS:
+        return None
+    check_simulator()
+    from ftl_lightning.domains.driving.expert import episode
+
+    drives = [torch.from_numpy(episode(*origin(start))[0][:, 0]) for start in starts.require_scenes().numpy()]
+    return lambda observed, rows, step: torch.stack([drives[row][min(step + 1, len(drives[row]) - 1)] for row in rows])
+
+
+POLICIES = {
+    "IDLE": _always("IDLE"),
+    "random": _random,
+    "FASTER": _always("FASTER"),
+    "nearest demonstration": _nearest,
+    "ridge regression": _regression(_ridge),
+    "MLP regression": _regression(_mlp),
+    "expert (oracle)": _expert,
+}
+"""Baseline policies by name; all are subject to the planner's veto."""
+
 
 RENDERING = "ftl_lightning.domains.driving.rendering"
 
 
 class Expert:
-    """Source of successful episodes of the expert, shipped and new.
+    """Source of successful episodes of the expert: shipped or new.
 
     Args:
         root: folder of user episodes of the training scenarios, instead of the shipped episodes.
@@ -64,29 +189,18 @@ class Expert:
     def draw(self, task: str, count: int, seed: int, workers: int = 1) -> Demonstrations:
         check_scenario(task)
         check_simulator()
-        from ftl_lightning.domains.driving.expert import BLIND, SEARCH
-        from ftl_lightning.domains.driving.generation import demonstrations
+        from ftl_lightning.domains.driving.expert import BLIND, SEARCH, demonstrations
         from ftl_lightning.domains.driving.scenarios import scenario
 
-        settings = {
-            "domain": NAME,
-            "task": task,
-            "count": count,
-            "seed": seed,
-            "config": scenario(task).config,
-            "search": SEARCH[task],
-            "beyond": HORIZON,
-            **({"blind": asdict(BLIND)} if self.blind else {}),
-        }
+        settings = {"domain": NAME, "task": task, "count": count, "seed": seed, "config": scenario(task).config}
+        settings |= {"search": SEARCH[task], "beyond": HORIZON, **({"blind": asdict(BLIND)} if self.blind else {})}
         return cached(settings, count, lambda progress: demonstrations(task, count, seed, workers, progress, self.blind))
 
     def starts(self, task: str, count: int, seed: int) -> InitialStates:
         """Initial states of new episodes, scenes ``(count, 37)``."""
-        check_scenario(task)
-        check_simulator()
-        from ftl_lightning.domains.driving.scenarios import make, observe
+        env = _simulation(check_scenario(task))
+        from ftl_lightning.domains.driving.scenarios import observe
 
-        env = make(task)
         scenes = []
         for number in range(count):
             start = episode_seed(seed, number)
@@ -97,11 +211,7 @@ class Expert:
 
 
 def environment(veto: str = BELIEF) -> "DrivingEnvironment":
-    """Environment of the domain with a veto of the planner.
-
-    Raises:
-        UserError: without the simulator, or for an unknown veto.
-    """
+    """Environment of the domain with a veto of the planner; raises a ``UserError`` without the simulator."""
     check_simulator()
     from ftl_lightning.domains.driving.environment import DrivingEnvironment
 
@@ -120,18 +230,15 @@ def judge(goal: str, rollout: Rollout) -> dict[str, Tensor]:
     return outcomes | {name: outcomes[name] > 0 for name in ("success", "strict success", "crash")}
 
 
-def _from_start(states: Tensor) -> Tensor:
-    """Paths ``(plan, horizon, 2)`` in metres, along and across the initial heading from the initial position."""
-    first = states[:, :1]
-    return turned(states[..., 1:3] - first[..., 1:3], first[..., 5], -first[..., 6])
-
-
 def distance(states: Tensor, others: Tensor) -> Tensor:
-    """Root mean square distance ``(a, b)`` in metres between paths of the controlled vehicle, relative to their initial pose.
+    """Root mean square distance ``(a, b)`` in metres between paths of the controlled vehicle, relative to their initial poses."""
 
-    The initial pose is given, not generated; the path depends on the traffic.
-    """
-    return path_distance(_from_start(states), _from_start(others))
+    def path(plans: Tensor) -> Tensor:
+        """Metres ``(plan, horizon, 2)`` along and across the initial heading."""
+        first = plans[:, :1]
+        return turned(plans[..., 1:3] - first[..., 1:3], first[..., 5], -first[..., 6])
+
+    return path_distance(path(states), path(others))
 
 
 DOMAIN = Domain(
@@ -158,7 +265,7 @@ DOMAIN = Domain(
         film=deferred(f"{RENDERING}:film"),
         vector_film=deferred(f"{RENDERING}:vector_film"),
         less_is_better=("crash",),
-        policies=policies.POLICIES,
+        policies=POLICIES,
         expect=check_simulator,
     ),
     comparison=Comparison(

@@ -10,9 +10,7 @@ from highway_env.envs.common.abstract import AbstractEnv
 from numpy.typing import NDArray
 
 from ftl_lightning.domains.driving.foresight import VETOES, Beliefs, Worlds
-from ftl_lightning.domains.driving.motion import drive
-from ftl_lightning.domains.driving.scenarios import SCENARIOS, arrived, make, observe
-from ftl_lightning.domains.driving.simulation import advance
+from ftl_lightning.domains.driving.scenarios import SCENARIOS, advance, arrived, make, observe
 from ftl_lightning.domains.driving.traffic import (
     BELIEF,
     FEATURES_SEEN,
@@ -26,11 +24,11 @@ from ftl_lightning.domains.driving.traffic import (
     origin,
     scene,
 )
-from ftl_lightning.services.errors import UserError
+from ftl_lightning.domains.driving.views import drive
+from ftl_lightning.services.errors import require
 
 DRIVE = 4
 """Columns of a drive."""
-
 Seen = dict[str, NDArray[np.float32]]
 """Observed features by name."""
 
@@ -39,7 +37,7 @@ class DrivingEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
     """Driving scenarios; scenario and seed determine the initial state.
 
     An observation is an initial state (37 numbers). An action is the desired state of the controlled vehicle after the step
-    (7 numbers), the desired drive (4, see :func:`~ftl_lightning.domains.driving.motion.drive`) for policies that do not know the
+    (7 numbers), the desired drive (4, see :func:`~ftl_lightning.domains.driving.views.drive`) for policies that do not know the
     road, or the number of a decision of the scenario (1). The planner selects the decisions of minimum risk
     (:mod:`ftl_lightning.domains.driving.foresight`) and takes the nearest to the action (Euclidean, raw units), at random among
     ties; it brakes if all crash. A numbered decision of higher risk is replaced by a random decision of minimum risk.
@@ -48,12 +46,13 @@ class DrivingEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
     paper's code), ``return`` (sum of rewards) and ``length``.
 
     Args:
-        veto: ``'belief'``, ``'simulation'`` or ``'step'`` (the paper's).
+        veto: ``'belief'``, ``'simulation'`` or ``'step'`` (the paper's); another raises a ``UserError``.
 
-    Raises:
-        UserError: for an unknown veto.
+    Attributes:
+        simulation: highway-env's environment of the scenario, after the first reset.
     """
 
+    simulation: AbstractEnv
     metadata = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012 (gymnasium's)
     render_mode = "rgb_array"
     observation_space: gymnasium.spaces.Space[Any] = gymnasium.spaces.Dict(
@@ -62,8 +61,7 @@ class DrivingEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
     action_space = gymnasium.spaces.Box(-np.inf, np.inf, (STATE,), np.float32)
 
     def __init__(self, veto: str = BELIEF) -> None:
-        if veto not in VETOES:
-            raise UserError(f"driving veto: expected one of {', '.join(VETOES)}, found {veto!r}")
+        require(veto in VETOES, "driving veto", f"one of {', '.join(VETOES)}", repr(veto))
         self.veto = veto
         self._name = ""
         self._seed = 0
@@ -71,11 +69,7 @@ class DrivingEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         self._length = 0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Seen, dict[str, Any]]:
-        """Reset to an initial state.
-
-        Args:
-            seed: seed of the initial state if no scene is given.
-            options: ``scene``, 37 numbers; or ``task``, a scenario (default 'roundabout').
+        """Reset to the initial state of ``options['scene']``, 37 numbers, or of a random seed in the scenario ``options['task']``.
 
         Raises:
             UserError: for a scene that its scenario and seed do not reproduce.
@@ -88,57 +82,43 @@ class DrivingEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         else:
             name, start = origin(np.asarray(given))
         if name != self._name:
-            self._env, self._name = make(name), name
+            self.simulation, self._name = make(name), name
         super().reset(seed=start)  # for ties between decisions
-        self._env.reset(seed=start)
+        self.simulation.reset(seed=start)
         self._seed, self._return, self._length = start, 0.0, 0
-        self._beliefs = Beliefs(self._env, name)
-        seen = observe(self._env)
-        if given is not None and not np.allclose(scene(seen, name, start), given, atol=1e-3):
-            raise UserError(
-                f"driving scene: expected the start of {name!r} that seed {start} gives, found another; episodes start at "
-                "starts, not in the middle of a drive"
-            )
+        self._beliefs = Beliefs(self.simulation, name)
+        seen = observe(self.simulation)
+        same = given is None or np.allclose(scene(seen, name, start), given, atol=1e-3)
+        expected = f"the initial state of {name!r} for seed {start}"
+        require(same, "driving scene", expected, "another; an episode cannot start in the middle of a drive")
         return self.observation(), {}
-
-    @property
-    def simulation(self) -> AbstractEnv:
-        """highway-env's environment of the scenario."""
-        return self._env
 
     def observation(self) -> Seen:
         """Current observation."""
         number = np.array([NAMES.index(self._name)], dtype=np.float32)
-        return {TRAFFIC: observe(self._env).reshape(OBSERVED).astype(np.float32), SCENARIO: number}
+        return {TRAFFIC: observe(self.simulation).reshape(OBSERVED).astype(np.float32), SCENARIO: number}
 
     def step(self, action: NDArray[np.float32]) -> tuple[Seen, float, bool, bool, dict[str, Any]]:
-        """Take a decision and simulate until the next.
-
-        Raises:
-            UserError: for an action of the wrong size or with numbers that are not finite.
-        """
+        """Take a decision and simulate until the next."""
         wish = np.asarray(action, dtype=np.float64)
-        if wish.shape not in ((STATE,), (DRIVE,), (1,)) or not np.isfinite(wish).all():
-            raise UserError(f"driving action: expected {STATE} finite numbers, {DRIVE} or 1, found {wish.tolist()}")
+        numbers = wish.shape in ((STATE,), (DRIVE,), (1,)) and np.isfinite(wish).all()
+        require(numbers, "driving action", f"{STATE} finite numbers, {DRIVE} or 1", wish.tolist())
         chosen = self.decide(wish)
-        reward, ended = advance(self._env, chosen)
+        reward, ended = advance(self.simulation, chosen)
         self._return += reward
         self._length += 1
         info = self._outcome() if ended or self._length >= MAX_STEPS else {}
         return self.observation(), reward, ended, self._length >= MAX_STEPS, info
 
     def decide(self, wish: NDArray[np.float64]) -> int:
-        """Return the decision of minimum risk nearest to an action (see the class); brake if all crash.
-
-        The simulation is left unchanged; random numbers for ties are consumed.
-        """
-        now = observe(self._env)[0].astype(np.float64)
+        """Return the decision of minimum risk nearest to an action, see the class; the simulation is left unchanged."""
+        now = observe(self.simulation)[0].astype(np.float64)
         self._beliefs.look()
         rng = np.random.default_rng([self._seed, self._length])
-        worlds = Worlds(self._env, VETOES[self.veto], self._beliefs, rng)
+        worlds = Worlds(self.simulation, VETOES[self.veto], self._beliefs, rng)
         if len(wish) == 1 and worlds.risk(int(wish[0])) == 0:
             return int(wish[0])
-        states = {decision: worlds.state(decision) for decision in range(self._env.action_space.n)}
+        states = {decision: worlds.state(decision) for decision in range(self.simulation.action_space.n)}
         there = {decision: state for decision, state in states.items() if state is not None}
         far = self._far(now, np.stack(list(there.values())), wish) if there and len(wish) > 1 else np.zeros(len(there))
         risks: dict[int, float] = {}
@@ -150,7 +130,7 @@ class DrivingEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
             nearest = distance if risks[decision] == 0 else nearest
         least = min(risks.values(), default=1)
         if least == 1:
-            return self._slower
+            return int(self.simulation.action_type.actions_indexes["SLOWER"])
         kept = [(decision, distance) for decision, distance in zip(there, far, strict=True) if risks.get(decision) == least]
         closest = min(distance for _, distance in kept)
         if len(wish) == 1 and int(wish[0]) in dict(kept):
@@ -165,28 +145,23 @@ class DrivingEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         distances: NDArray[np.float64] = np.linalg.norm(states - wish, axis=1)
         return distances
 
-    @property
-    def _slower(self) -> int:
-        return int(self._env.action_type.actions_indexes["SLOWER"])
-
     def _outcome(self) -> dict[str, float]:
-        crashed = bool(self._env.vehicle.crashed)
-        there = arrived(self._env, self._name)
+        crashed = bool(self.simulation.vehicle.crashed)
+        there = arrived(self.simulation, self._name)
         passed = SCENARIOS[self._name].passed
         return {
             "crashed": crashed,
             "arrived": there and not crashed,
-            "passed": passed(self._env) if passed else there and not crashed,
+            "passed": passed(self.simulation) if passed else there and not crashed,
             "return": self._return,
             "length": self._length,
         }
 
     def render(self) -> NDArray[np.uint8]:
         """Top-view picture ``(height, width, 3)``."""
-        picture: NDArray[np.uint8] = self._env.render()
-        return picture
+        return np.asarray(self.simulation.render(), dtype=np.uint8)
 
     def close(self) -> None:
         """Close the simulation."""
         if self._name:
-            self._env.close()
+            self.simulation.close()

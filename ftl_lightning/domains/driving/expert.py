@@ -2,19 +2,45 @@
 
 import heapq
 import itertools
+import logging
 import math
-from collections.abc import Iterator, Sequence
+import multiprocessing
+import signal
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
 
 import numpy as np
+import torch
 from highway_env.envs.common.abstract import AbstractEnv
 from numpy.typing import NDArray
 
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.driving.foresight import FRAMES, VETOES, Beliefs, Worlds, meaning
-from ftl_lightning.domains.driving.scenarios import arrived, make, observe
-from ftl_lightning.domains.driving.simulation import Snapshot, advance, restore, save
-from ftl_lightning.domains.driving.traffic import BELIEF
+from ftl_lightning.domains.driving.scenarios import SCENARIOS, Snapshot, advance, arrived, make, observe, restore, save
+from ftl_lightning.domains.driving.traffic import (
+    BELIEF,
+    FEATURES_SEEN,
+    HORIZON,
+    NAME,
+    NAMES,
+    OBSERVED,
+    SCENARIO,
+    STATE,
+    STATE_NAMES,
+    STATE_UNITS,
+    TRAFFIC,
+    VEHICLES,
+    decision_seconds,
+    episode_seed,
+    scene,
+)
+from ftl_lightning.services.errors import UserError, require
+from ftl_lightning.services.tensor_file import cache_folder, content_hash, load_tensors, save_tensors
+
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -36,15 +62,11 @@ class Search:
     sight: float = math.inf
 
 
-SEARCH = {
+SEARCH = dict.fromkeys(NAMES, Search(75, 0.9)) | {
     "highway": Search(75, 0.7, sight=200),
     "exit": Search(200, 0.85, frequency=5, sight=120),
     "merge": Search(75, 0.7, frequency=5),
     "intersection": Search(75, 0.9, hold=2),
-    "roundabout": Search(75, 0.9),
-    "roundabout third exit": Search(75, 0.9),
-    "roundabout of three lanes": Search(75, 0.9),
-    "roundabout of one lane": Search(75, 0.9),
 }
 
 IDLE = 1
@@ -71,8 +93,8 @@ BLIND = Blind()
 def plan(env: AbstractEnv, name: str) -> int:
     """Return the next action; the environment is left unchanged.
 
-    A tree of action sequences grows at the leaf of highest optimistic value: its discounted return plus the maximum reward, 1 per
-    step, from there on. Once the budget is spent, the first action of the sequence with the highest return is taken.
+    A tree of action sequences grows at the leaf of highest optimistic value: its discounted return plus the maximum future reward,
+    1 per step. Once the budget is spent, the first action of the sequence with the highest return is taken.
     """
     search = SEARCH[name]
     with _searching(env, search):
@@ -81,13 +103,13 @@ def plan(env: AbstractEnv, name: str) -> int:
 
 
 def plan_blind(env: AbstractEnv, name: str, beliefs: Beliefs, rng: np.random.Generator) -> int:
-    """Return the next action of the blind expert: the same search in sampled worlds, with the same veto.
+    """Return the next action of the blind expert; the environment is left unchanged.
 
-    The value of an action is the mean return of its best sequence over the worlds. The best action of tolerated risk is taken, else
-    the best action of minimum risk.
+    The expert searches sampled worlds with the planner's veto. The value of an action is the mean return of its best sequence over
+    the worlds. The best action of tolerated risk is taken, else the best action of minimum risk.
 
     Args:
-        env: left unchanged.
+        env: the simulation.
         name: name of the scenario.
         beliefs: beliefs, updated for this decision.
         rng: generator for sampled worlds.
@@ -163,12 +185,6 @@ def _values(env: AbstractEnv, name: str, search: Search, first_actions: Sequence
 def drive(name: str, seed: int, env: AbstractEnv | None = None, blind: bool = False) -> tuple[NDArray[np.float32], bool]:
     """Run an episode of the expert.
 
-    Args:
-        name: name of the scenario.
-        seed: seed of the episode.
-        env: existing environment of this scenario, if any.
-        blind: whether the expert knows only observations.
-
     Returns:
         Observations ``(time, 5, 7)``, and success: at the destination without a crash.
     """
@@ -182,3 +198,101 @@ def drive(name: str, seed: int, env: AbstractEnv | None = None, blind: bool = Fa
         _, ended = advance(env, plan_blind(env, name, beliefs, rng) if blind else plan(env, name))
         seen.append(observe(env))
     return np.stack(seen), not env.vehicle.crashed and arrived(env, name)
+
+
+KIND = "driving episode"
+MOST = 4
+"""Maximum number of episodes driven per kept episode."""
+
+
+def shard(name: str, seed: int, blind: bool = False) -> Path:
+    """Cache file of an episode."""
+    belief = [BLIND.__dict__, VETOES[BELIEF].__dict__] if blind else []
+    key = content_hash([name, SCENARIOS[name].config, SEARCH[name].__dict__, *belief])
+    return cache_folder() / f"{NAME}-{key}" / f"{seed}.safetensors"
+
+
+def episode(name: str, seed: int, blind: bool = False) -> tuple[np.ndarray, bool]:
+    """Observations ``(time, 5, 7)`` and success of an expert episode, from the cache if present.
+
+    If the simulation raises an error, the episode counts as rejected and is not cached.
+
+    Raises:
+        UserError: if the machine fails, independently of the episode.
+    """
+    path = shard(name, seed, blind)
+    if path.is_file():
+        try:
+            tensors, header = load_tensors(path, KIND)
+            return tensors["observations"].numpy(), bool(header["succeeded"])
+        except UserError:
+            path.unlink()  # damaged: drive again
+    try:
+        seen, succeeded = drive(name, seed, blind=blind)
+    except (MemoryError, OSError) as error:
+        raise UserError(f"driving {name!r}, seed {seed}: the machine failed ({error!r}); run it again, it goes on here") from error
+    except Exception as error:  # errors of the simulation: continue with further episodes
+        _LOG.warning("driving %r, seed %d: %r; the episode counts as rejected and is not kept", name, seed, error)
+        return np.zeros((1, VEHICLES, STATE), dtype=np.float32), False
+    save_tensors(path, KIND, {"observations": torch.from_numpy(seen)}, {"succeeded": succeeded})
+    return seen, succeeded
+
+
+def driven_on(seen: np.ndarray, name: str, length: int) -> np.ndarray:
+    """Extend observations ``(time, 5, 7)`` to ``length``: vehicles drive straight on after the end.
+
+    Plans extend beyond the end of an episode. Padding with standing vehicles would teach that episodes end with a stop.
+    """
+    times = decision_seconds(name) * np.arange(1, length - len(seen) + 1)[:, None, None]
+    beyond = np.repeat(seen[-1:], len(times), axis=0)
+    beyond[..., 1:3] += (times * beyond[..., 3:5]).astype(np.float32)
+    return np.concatenate((seen, beyond))
+
+
+def _episodes(name: str, seeds: list[int], workers: int, blind: bool) -> Iterator[tuple[np.ndarray, bool]]:
+    run = partial(episode, name, blind=blind)
+    if workers == 1:
+        yield from map(run, seeds)
+        return
+    # Only this process handles Ctrl-C; it then ends the workers.
+    with multiprocessing.get_context("spawn").Pool(workers, signal.signal, (signal.SIGINT, signal.SIG_IGN)) as pool:
+        yield from pool.imap(run, seeds)
+
+
+def demonstrations(
+    name: str, count: int, seed: int, workers: int, progress: Callable[[], None], blind: bool = False
+) -> Demonstrations:
+    """The first ``count`` successful episodes of a scenario in order of their seeds, for any number of workers.
+
+    ``progress`` is called after each successful episode.
+
+    Raises:
+        UserError: if too few episodes succeed.
+    """
+    kept: list[tuple[int, np.ndarray]] = []
+    driven = 0
+    seeds = [episode_seed(seed, number) for number in range(MOST * count)]
+    for driven, (seen, succeeded) in enumerate(_episodes(name, seeds, workers, blind), start=1):
+        if succeeded:
+            kept.append((seeds[driven - 1], seen))
+            progress()
+        if len(kept) == count:
+            break
+    require(len(kept) == count, f"driving {name!r}", f"{count} successful episodes of {driven}", len(kept))
+    longest = max(len(seen) for _, seen in kept) + HORIZON
+    seen = np.stack([driven_on(seen, name, longest) for _, seen in kept])
+    traffic = torch.from_numpy(seen).float().flatten(2)
+    scenes = torch.from_numpy(np.stack([scene(seen[0], name, start) for start, seen in kept]))
+    provenance = {"generator": NAME, "seed": seed, "count": count, "driven": driven, "rejected": driven - count}
+    return Demonstrations(
+        states=traffic[..., :STATE].contiguous(),
+        lengths=torch.tensor([len(seen) for _, seen in kept]),
+        domain=NAME,
+        state_names=STATE_NAMES,
+        state_units=STATE_UNITS,
+        concepts=(name,) * count,
+        observed={TRAFFIC: traffic, SCENARIO: scenes[:, None, OBSERVED : OBSERVED + 1].repeat(1, longest, 1)},
+        per_step=tuple(FEATURES_SEEN),
+        scenes=scenes,
+        provenance=provenance | ({"expert": "blind"} if blind else {}),
+    )

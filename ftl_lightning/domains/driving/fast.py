@@ -6,6 +6,7 @@ within an environment. Results are the same up to the order of additions, see th
 """
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -28,75 +29,54 @@ def _wrap(angle: float) -> float:
     return (angle + math.pi) % (2 * math.pi) - math.pi
 
 
-class FastStraightLane(StraightLane):
-    """Straight lane with scalar arithmetic."""
+class _FastLane:
+    """Lane with scalar arithmetic; a subclass computes coordinates by ``_local(x, y)``."""
+
+    _local: Callable[[float, float], tuple[float, float]]
+    heading_at: Callable[[float], float]
+    length: float
 
     def local_coordinates(self, position: Any) -> tuple[float, float]:
-        x, y = position.tolist()
-        x0, y0, dx, dy = self._line
-        x, y = x - x0, y - y0
-        return x * dx + y * dy, y * dx - x * dy
+        return self._local(*position.tolist())
 
-    def nearer(self, x: float, y: float, heading: float, than: float) -> float | None:
-        """Return ``distance_with_heading`` if it is below the bound ``than``, else ``None``."""
-        x0, y0, dx, dy = self._line
-        x, y = x - x0, y - y0
-        s = x * dx + y * dy
-        distance = abs(y * dx - x * dy) + (s - self.length if s > self.length else -s if s < 0 else 0)
-        if distance < than and (distance := distance + abs(_wrap(heading - self.heading))) < than:
+    def nearer(self, x: float, y: float, heading: float, bound: float) -> float | None:
+        """Return ``distance_with_heading`` if it is below the bound, else ``None``."""
+        s, r = self._local(x, y)
+        distance = abs(r) + (s - self.length if s > self.length else -s if s < 0 else 0)
+        if distance < bound and (distance := distance + abs(_wrap(heading - self.heading_at(s)))) < bound:
             return distance
         return None
 
 
-class FastSineLane(SineLane):
-    """Sine-shaped lane with scalar arithmetic."""
+class FastStraightLane(_FastLane, StraightLane):
+    """Straight lane."""
 
-    local_coordinates_along = FastStraightLane.local_coordinates
+    def _local(self, x: float, y: float) -> tuple[float, float]:
+        x0, y0, dx, dy = self._line
+        x, y = x - x0, y - y0
+        return x * dx + y * dy, y * dx - x * dy
 
-    def local_coordinates(self, position: Any) -> tuple[float, float]:
-        s, r = self.local_coordinates_along(position)
+
+class FastSineLane(FastStraightLane, SineLane):
+    """Sine-shaped lane."""
+
+    def _local(self, x: float, y: float) -> tuple[float, float]:
+        s, r = super()._local(x, y)
         return s, r - self.amplitude * math.sin(self.pulsation * s + self.phase)
 
     def heading_at(self, longitudinal: float) -> float:
         slope = self.amplitude * self.pulsation * math.cos(self.pulsation * longitudinal + self.phase)
         return self.heading + math.atan(slope)
 
-    def nearer(self, x: float, y: float, heading: float, than: float) -> float | None:
-        """As of :class:`FastStraightLane`."""
-        x0, y0, dx, dy = self._line
-        x, y = x - x0, y - y0
-        s, r = x * dx + y * dy, y * dx - x * dy
-        beyond = s - self.length if s > self.length else -s if s < 0 else 0
-        if abs(r) - abs(self.amplitude) + beyond > than:
-            return None
-        distance = abs(r - self.amplitude * math.sin(self.pulsation * s + self.phase)) + beyond
-        if distance < than and (distance := distance + abs(_wrap(heading - self.heading_at(s)))) < than:
-            return distance
-        return None
 
+class FastCircularLane(_FastLane, CircularLane):
+    """Circular lane."""
 
-class FastCircularLane(CircularLane):
-    """Circular lane with scalar arithmetic."""
-
-    def local_coordinates(self, position: Any) -> tuple[float, float]:
-        x, y = position.tolist()
+    def _local(self, x: float, y: float) -> tuple[float, float]:
         x0, y0 = self._centre
         x, y = x - x0, y - y0
         turned = _wrap(math.atan2(y, x) - self.start_phase)
         return self.direction * turned * self.radius, self.direction * (self.radius - math.sqrt(x * x + y * y))
-
-    def nearer(self, x: float, y: float, heading: float, than: float) -> float | None:
-        """As of :class:`FastStraightLane`."""
-        x0, y0 = self._centre
-        x, y = x - x0, y - y0
-        distance = abs(self.radius - math.sqrt(x * x + y * y))
-        if distance >= than:
-            return None
-        s = self.direction * _wrap(math.atan2(y, x) - self.start_phase) * self.radius
-        distance += s - self.length if s > self.length else -s if s < 0 else 0
-        if distance < than and (distance := distance + abs(_wrap(heading - self.heading_at(s)))) < than:
-            return distance
-        return None
 
 
 _LANES = {StraightLane: FastStraightLane, SineLane: FastSineLane, CircularLane: FastCircularLane}
@@ -114,7 +94,7 @@ class FastNetwork(RoadNetwork):
         if likely is not None:
             # Most lanes are farther than the previous lane. Ties go to the first lane.
             best = math.nextafter(self.get_lane(likely).nearer(x, y, heading, math.inf), math.inf)
-            off_x, off_y, reach = self._middles[0] - x, self._middles[1] - y, self._middles[2] + best
+            off_x, off_y, reach = self._circles[0] - x, self._circles[1] - y, self._circles[2] + best
             lanes = [lanes[number] for number in (off_x * off_x + off_y * off_y <= reach * reach).nonzero()[0].tolist()]
         for index, lane in lanes:
             if (distance := lane.nearer(x, y, heading, best)) is not None:
@@ -170,9 +150,8 @@ class FastVehicle(IDMVehicle):
 
     def desired_gap(self, ego_vehicle: Any, front_vehicle: Any = None, projected: bool = True) -> float:
         speed = ego_vehicle.speed
-        closing = speed - front_vehicle.speed
-        if projected:
-            closing = speed - front_vehicle.speed * math.cos(front_vehicle.heading - ego_vehicle.heading)
+        turned = math.cos(front_vehicle.heading - ego_vehicle.heading) if projected else 1
+        closing = speed - front_vehicle.speed * turned
         both = math.sqrt(-self.COMFORT_ACC_MAX * self.COMFORT_ACC_MIN)
         return self.DISTANCE_WANTED + speed * self.TIME_WANTED + speed * closing / (2 * both)
 
@@ -228,12 +207,11 @@ class FastRoad(Road):
         if known is None or self.neighbour_vehicles_connected_lanes or not lane_index:
             return super().neighbour_vehicles(vehicle, lane_index)
         lane = self.network.get_lane(lane_index)
-        there = known.get(lane_index)
-        if there is None:
-            there = known[lane_index] = self._along(lane)
+        if lane_index not in known:
+            known[lane_index] = self._along(lane)
         s = lane.local_coordinates(vehicle.position)[0]
         front, rear, v_front, v_rear = math.inf, -math.inf, None, None
-        for s_v, v in there:
+        for s_v, v in known[lane_index]:
             if v is vehicle:
                 continue
             if s_v >= s:
@@ -311,7 +289,7 @@ def accelerate(road: Road) -> None:
             lane._centre = tuple(map(float, lane.center))
         lane.__class__ = _LANES.get(type(lane), type(lane))
     network._lanes = list(network.lanes_dict().items())
-    network._middles = np.array([_around(lane) for _, lane in network._lanes]).T
+    network._circles = np.array([_circle(lane) for _, lane in network._lanes]).T
     network.__class__ = FastNetwork
     road.__class__ = _ROADS.get(type(road), type(road))
     for vehicle in road.vehicles:
@@ -319,13 +297,12 @@ def accelerate(road: Road) -> None:
             vehicle.__class__ = FastController
 
 
-def _around(lane: Any) -> tuple[float, float, float]:
+MARGIN = 8.0
+"""Margin of circles around lanes in metres: gaps between sampled points, and inexact distances beyond the ends of sine lanes."""
+
+
+def _circle(lane: Any) -> tuple[float, float, float]:
     """Centre and radius of a circle around a lane's centre line."""
     line = np.array([lane.position(s, 0) for s in np.linspace(0, lane.length, 50)])
     middle = (line.min(axis=0) + line.max(axis=0)) / 2
-    return float(middle[0]), float(middle[1]), float(np.linalg.norm(line - middle, axis=1).max()) + ROUND
-
-
-ROUND = 8.0
-"""Margin of circles around lanes in metres, for the gaps between sampled points and the inexact distance beyond the ends of sine
-lanes."""
+    return float(middle[0]), float(middle[1]), float(np.linalg.norm(line - middle, axis=1).max()) + MARGIN

@@ -21,8 +21,7 @@ import numpy as np
 from highway_env.envs.common.abstract import AbstractEnv
 from numpy.typing import NDArray
 
-from ftl_lightning.domains.driving.scenarios import observe, scenario
-from ftl_lightning.domains.driving.simulation import Snapshot, advance, restore, save
+from ftl_lightning.domains.driving.scenarios import Snapshot, advance, observe, restore, save, scenario
 from ftl_lightning.domains.driving.traffic import BELIEF, SIMULATION, STEP
 
 
@@ -51,15 +50,11 @@ Meaning = tuple[float, tuple[str, str, int]]
 
 
 class Beliefs:
-    """Beliefs about the other vehicles, from their present and past observations.
+    """Beliefs about the other vehicles of a scenario, from their present and past observations.
 
     Position, heading, speed and crash are observed. Destination, IDM exponent, desired speed and lane changes are hidden. A belief
     samples the destination uniformly from those still reachable in the scenario, and the exponent from highway-env's range. The
     desired speed is the highest observed speed; vehicles keep their lane. Vehicles that appear later are unknown too.
-
-    Args:
-        env: the simulation.
-        name: name of the scenario.
     """
 
     def __init__(self, env: AbstractEnv, name: str) -> None:
@@ -80,8 +75,7 @@ class Beliefs:
 
     def _others(self) -> list[Any]:
         ego = self._env.vehicle
-        others = [vehicle for vehicle in self._env.road.vehicles if vehicle is not ego]
-        return [vehicle for vehicle in others if math.dist(vehicle.position, ego.position) < SIGHT]
+        return [v for v in self._env.road.vehicles if v is not ego and math.dist(v.position, ego.position) < SIGHT]
 
     def draw(self, rng: np.random.Generator) -> None:
         """Replace the simulation's state by a sampled world: other vehicles and random state."""
@@ -123,14 +117,7 @@ def meaning(env: AbstractEnv, decision: int) -> Meaning:
 
 
 class Worlds:
-    """Worlds of a veto at the present time.
-
-    Args:
-        env: the simulation, left unchanged.
-        foresight: the veto.
-        beliefs: beliefs about other vehicles.
-        rng: generator for sampled worlds.
-    """
+    """Worlds of a veto at the present time; the simulation is left unchanged."""
 
     def __init__(self, env: AbstractEnv, foresight: Foresight, beliefs: Beliefs, rng: np.random.Generator) -> None:
         self._env, self._foresight = env, foresight

@@ -41,6 +41,9 @@ LEGEND = (
     Line2D([], [], color=PLAN, marker=".", label="plan"),
 )
 
+Window = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""Lower and upper corner ``(2,)`` of a map section."""
+
 
 @functools.cache
 def _lanes(name: str) -> tuple[NDArray[np.float64], ...]:
@@ -58,8 +61,8 @@ def _lanes(name: str) -> tuple[NDArray[np.float64], ...]:
     return tuple(lanes)
 
 
-def _window(around: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Lower and upper corner ``(2,)`` of a map section around points ``(points, 2)``, within :data:`MAX_ASPECT`."""
+def _window(around: NDArray[np.float32]) -> Window:
+    """Map section around points ``(points, 2)``, within :data:`MAX_ASPECT`."""
     low, high = around.min(axis=0).astype(float) - MARGIN, around.max(axis=0).astype(float) + MARGIN
     missing = np.maximum((high - low).max() / MAX_ASPECT - (high - low), 0) / 2
     return low - missing, high + missing
@@ -70,7 +73,7 @@ def _draw(
     name: str,
     vehicles: NDArray[np.float32],
     plan: NDArray[np.float32] | None,
-    window: tuple[NDArray[np.float64], NDArray[np.float64]],
+    window: Window,
 ) -> None:
     """Draw lanes and vehicles ``(vehicle, 7)`` to scale, the controlled vehicle first."""
     low, high = window
@@ -92,13 +95,9 @@ def _draw(
 
 
 def render(states: Tensor, right: Sequence[bool] | None, title: str, starts: InitialStates | None) -> Figure:
-    """Draw a grid of at most :data:`MAX_PANELS` scenes with their plans, to scale, and a legend.
+    """Draw a grid of at most :data:`MAX_PANELS` scenes with their plans ``(scene, horizon, 7)``, to scale, and a legend.
 
-    Args:
-        states: plans ``(scene, horizon, 7)``.
-        right: whether each plan is right (green and red frames); ``None`` for grey frames.
-        title: title above the grid.
-        starts: initial states of the scenes.
+    Frames are green for right plans, red for wrong plans, and grey for ``None``.
     """
     starts = check_starts(starts)
     shown = states[:MAX_PANELS].numpy()
@@ -123,10 +122,13 @@ def render(states: Tensor, right: Sequence[bool] | None, title: str, starts: Ini
     return figure
 
 
-def _end(observations: Tensor) -> int:
-    """Number of decisions ``(decision, vehicle * 7)`` until nothing moves any more."""
-    moving = (observations[1:, 1:3] - observations[:-1, 1:3]).abs().amax(dim=1) > 0
-    return int(moving.nonzero().max()) + 2 if moving.any() else 1
+def _driven(rollout: Rollout) -> tuple[str, NDArray[np.float32]]:
+    """Scenario, and vehicles ``(decision, 5, 7)`` of an episode until nothing moves any more."""
+    episode = take(rollout.observed, 0)
+    traffic = episode[TRAFFIC].unflatten(1, (VEHICLES, -1))
+    moving = traffic[:, 0, 1:3].diff(dim=0).abs().amax(dim=1) > 0
+    end = int(moving.nonzero().max()) + 2 if moving.any() else 1
+    return NAMES[int(episode[SCENARIO][0].item())], traffic[:end].numpy()
 
 
 def film(rollout: Rollout, plans: Tensor) -> list[NDArray[np.uint8]]:
@@ -135,17 +137,14 @@ def film(rollout: Rollout, plans: Tensor) -> list[NDArray[np.uint8]]:
     Positions are interpolated between decisions. The driven path is green, the current plan of ``plans (time, 8, 7)`` orange. The
     caption shows scenario, time and speed, and in the last frame the outcome.
     """
-    episode = take(rollout.observed, 0)
-    observations = episode[TRAFFIC]
-    end = _end(observations)
-    ways = observations[:end, 1:3].numpy()
+    name, traffic = _driven(rollout)
+    end, ways = len(traffic), traffic[:, 0, 1:3]
     planned = plans[:end, :, 1:3].reshape(-1, 2).numpy()
     near = np.clip(planned[np.isfinite(planned).all(axis=1)], ways.min(axis=0) - PLAN_REACH, ways.max(axis=0) + PLAN_REACH)
     window = _window(np.concatenate((ways, near)))
     width, height = np.sqrt(1.7 * AREA) * np.sqrt((window[1] - window[0]) / (window[1] - window[0])[::-1])
-    name, info = NAMES[int(episode[SCENARIO][0].item())], rollout.infos[0]
+    info = rollout.infos[0]
     ended = "crashed" if info.get("crashed") else "arrived" if info.get("arrived") else "time is up" if info else "broke off"
-    traffic = observations[:end].unflatten(1, (VEHICLES, -1)).numpy()
     vehicles = np.stack([traffic[:, 0], *_followed(traffic[:, 1:], decision_seconds(name))], axis=1)
     pictures = []
     for moment in np.arange((end - 1) * BETWEEN + 1) / BETWEEN:
@@ -156,7 +155,7 @@ def film(rollout: Rollout, plans: Tensor) -> list[NDArray[np.uint8]]:
         seen = _between(vehicles[time], vehicles[min(time + 1, end - 1)], moment - time)
         _draw(axes, name, seen, plans[time].numpy() if time < len(plans) else None, window)
         axes.plot(*np.concatenate((ways[: time + 1], seen[:1, 1:3])).T, color=EGO, linewidth=1.5, zorder=1)
-        now = f"{name}, {time * decision_seconds(name):g} s, {observations[time, 3:5].norm():.0f} m/s"
+        now = f"{name}, {time * decision_seconds(name):g} s, {np.linalg.norm(traffic[time, 0, 3:5]):.0f} m/s"
         axes.set_title(f"{now}: {ended}" if moment == end - 1 else now, fontsize=9)
         figure.legend(handles=LEGEND, loc="outside lower center", ncols=len(LEGEND), frameon=False, fontsize=7, columnspacing=1)
         canvas.draw()
@@ -172,8 +171,6 @@ def _between(before: NDArray[np.float32], after: NDArray[np.float32], part: floa
 
 PLAYED = 2.0
 """Playback speed of vector films relative to real time."""
-
-
 FAR = 100.0
 """Metres of road around moving objects in vector films; a page shows a part of it."""
 SAME = 12.0
@@ -182,9 +179,7 @@ SAME = 12.0
 
 def vector_film(rollout: Rollout) -> VectorFilm:
     """Top-view film of an episode, a frame per decision, until nothing moves; roads grey, controlled vehicle green."""
-    episode = take(rollout.observed, 0)
-    name = NAMES[int(episode[SCENARIO][0].item())]
-    traffic = episode[TRAFFIC][: _end(episode[TRAFFIC])].unflatten(1, (VEHICLES, -1)).numpy()
+    name, traffic = _driven(rollout)
     others = [Shape("area", _corners(seen), OTHER) for seen in _followed(traffic[:, 1:], decision_seconds(name))]
     return _from_above(name, others, traffic[:, 0])
 

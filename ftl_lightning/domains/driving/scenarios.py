@@ -17,6 +17,7 @@ from highway_env.envs.intersection_env import IntersectionEnv
 from highway_env.envs.merge_env import MergeEnv
 from highway_env.envs.roundabout_env import RoundaboutEnv, RoundaboutGenericEnv
 from highway_env.vehicle.behavior import IDMVehicle
+from highway_env.vehicle.objects import RoadObject
 from numpy.typing import NDArray
 
 from ftl_lightning.domains.driving.fast import FastVehicle, accelerate
@@ -116,9 +117,11 @@ class Scenario:
     Attributes:
         environment: class of the environment.
         config: settings that differ from highway-env's.
-        drivers: classes of the other vehicles, original and fast.
         arrived: whether the vehicle is at its destination, crashed or not; on the highway, whether time is up.
         passed: weaker criterion of the paper's code, crashed or not; ``None`` for ``arrived`` without a crash.
+        drivers: classes of the other vehicles, original and fast.
+        destinations: possible destinations of the other vehicles.
+        cruise: minimum desired speed of the other vehicles, in m/s.
     """
 
     environment: type[AbstractEnv]
@@ -136,6 +139,14 @@ def _on(*roads: tuple[str, str]) -> Callable[[AbstractEnv], bool]:
 
 EXITS = ("exr", "sxr", "nxr")
 """Exits of the roundabout for other vehicles."""
+
+
+def _other_roundabout(radius: int, lanes: int, vehicles: int) -> Scenario:
+    config = {"duration": 12, "roundabout_radius": radius, "roundabout_lanes": lanes, "vehicles_count": vehicles}
+    return Scenario(OtherRoundabout, config, _SECOND_EXIT, destinations=(*EXITS, "wxr"))
+
+
+_SECOND_EXIT = _on(("nx", "nxs"), ("nxs", "nxr"))
 SCENARIOS = {
     "highway": Scenario(Highway, {"duration": 10}, lambda env: bool(env.time >= env.config["duration"])),
     "exit": Scenario(
@@ -154,10 +165,7 @@ SCENARIOS = {
     "merge": Scenario(Merge, {}, lambda env: bool(env.vehicle.position[0] > Merge.END)),
     "intersection": Scenario(
         Intersection,
-        {
-            "policy_frequency": 2,
-            "normalize_reward": True,
-        },
+        {"policy_frequency": 2, "normalize_reward": True},
         lambda env: bool(env.has_arrived(env.vehicle)),
         drivers=(IntersectionVehicle, FastIntersectionVehicle),
         destinations=("o0", "o1", "o2", "o3"),
@@ -166,45 +174,23 @@ SCENARIOS = {
     "roundabout": Scenario(
         Roundabout,
         {"duration": 8},
-        _on(("nx", "nxs"), ("nxs", "nxr")),
+        _SECOND_EXIT,
         passed=lambda env: bool(env.vehicle.position[1] < -20),
         destinations=EXITS,
     ),
     "roundabout third exit": Scenario(ThirdExit, {"duration": 10}, _on(("wx", "wxs"), ("wxs", "wxr")), destinations=EXITS),
-    "roundabout of three lanes": Scenario(
-        OtherRoundabout,
-        {"duration": 12, "roundabout_radius": 28, "roundabout_lanes": 3, "vehicles_count": 7},
-        _on(("nx", "nxs"), ("nxs", "nxr")),
-        destinations=(*EXITS, "wxr"),
-    ),
-    "roundabout of one lane": Scenario(
-        OtherRoundabout,
-        {"duration": 12, "roundabout_radius": 16, "roundabout_lanes": 1, "vehicles_count": 4},
-        _on(("nx", "nxs"), ("nxs", "nxr")),
-        destinations=(*EXITS, "wxr"),
-    ),
+    "roundabout of three lanes": _other_roundabout(radius=28, lanes=3, vehicles=7),
+    "roundabout of one lane": _other_roundabout(radius=16, lanes=1, vehicles=4),
 }
 
 
 def scenario(name: str) -> Scenario:
-    """Scenario by name.
-
-    Raises:
-        UserError: for an unknown name.
-    """
+    """Scenario by name; an unknown name raises a ``UserError``."""
     return SCENARIOS[check_scenario(name)]
 
 
 def make(name: str, fast: bool = True) -> AbstractEnv:
-    """Environment of a scenario.
-
-    Args:
-        name: name of the scenario.
-        fast: whether to use :mod:`ftl_lightning.domains.driving.fast`.
-
-    Raises:
-        UserError: for an unknown name.
-    """
+    """Environment of a scenario, in the classes of :mod:`ftl_lightning.domains.driving.fast` unless ``fast`` is false."""
     chosen = scenario(name)
     drivers = chosen.drivers[fast]
     config = {"observation": OBSERVATION, "other_vehicles_type": f"{drivers.__module__}.{drivers.__name__}", "fast": fast}
@@ -230,3 +216,57 @@ def observe(env: AbstractEnv) -> NDArray[np.float32]:
 for _name in SCENARIOS:
     _id = f"ftl/driving-{_name.replace(' ', '-')}-v0"
     gymnasium.register(_id, entry_point=f"{__name__}:{make.__name__}", kwargs={"name": _name})
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """State that stepping changes, a hundred times cheaper than a deep copy of the simulation.
+
+    Attributes:
+        time, steps, road_steps: counters.
+        vehicles, objects: objects with copies of their attributes.
+        random: state of the random generator.
+    """
+
+    time: float
+    steps: int
+    road_steps: int
+    vehicles: list[tuple[RoadObject, dict[str, Any]]]
+    objects: list[tuple[RoadObject, dict[str, Any]]]
+    random: dict[str, Any]
+
+
+_MUTABLE: dict[type, Callable[[Any], Any]] = {np.ndarray: np.copy, list: list, dict: dict}
+
+
+def _copied(attributes: dict[str, Any]) -> dict[str, Any]:
+    return {name: _MUTABLE[type(value)](value) if type(value) in _MUTABLE else value for name, value in attributes.items()}
+
+
+def save(env: AbstractEnv) -> Snapshot:
+    """Copy the state that stepping changes."""
+    road = env.road
+    vehicles, objects = ([(thing, _copied(vars(thing))) for thing in things] for things in (road.vehicles, road.objects))
+    return Snapshot(env.time, env.steps, getattr(road, "steps", 0), vehicles, objects, env.np_random.bit_generator.state)
+
+
+def restore(env: AbstractEnv, snapshot: Snapshot) -> None:
+    """Restore a snapshot of this environment, taken since its last reset."""
+    env.time, env.steps = snapshot.time, snapshot.steps
+    env.road.steps = snapshot.road_steps
+    env.road.vehicles = [vehicle for vehicle, _ in snapshot.vehicles]
+    for thing, attributes in (*snapshot.vehicles, *snapshot.objects):
+        thing.__dict__.clear()
+        thing.__dict__.update(_copied(attributes))
+    env.np_random.bit_generator.state = snapshot.random
+
+
+def advance(env: AbstractEnv, action: int) -> tuple[float, bool]:
+    """Step without the observation, which costs more than the physics; return the reward and whether the episode ended."""
+    observe = env.observation_type.observe
+    env.observation_type.observe = lambda: None
+    try:
+        _, reward, terminated, truncated, _ = env.step(action)
+    finally:
+        env.observation_type.observe = observe
+    return float(reward), bool(terminated or truncated)

@@ -1,13 +1,18 @@
-"""Traffic without the simulator: scenario names, observed features and initial states."""
+"""Driving without the simulator: observations, initial states, tasks, the paper's numbers, and shipped demonstrations."""
 
 import zlib
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.data.features import Feature, InitialStates
-from ftl_lightning.services.errors import UserError
+from ftl_lightning.domains.comparison import OURS, Published
+from ftl_lightning.domains.domain import Split
+from ftl_lightning.domains.tasks import EvaluationTask, Suite, training_suite
+from ftl_lightning.services.errors import require
 from ftl_lightning.services.extras import check_extra
 
 NAME = "driving"
@@ -38,48 +43,26 @@ SEEDS = 2**24
 BELIEF, SIMULATION, STEP = "belief", "simulation", "step"
 """Names of the planner's vetoes, see :mod:`ftl_lightning.domains.driving.foresight`."""
 
-DECISIONS = {
-    "highway": 1,
-    "exit": 1,
-    "merge": 1,
-    "intersection": 2,
-    "roundabout": 1,
-    "roundabout third exit": 1,
-    "roundabout of three lanes": 1,
-    "roundabout of one lane": 1,
-}
-"""Decisions per second by scenario."""
-NAMES = tuple(DECISIONS)
+TRAINING_CONCEPTS = ("highway", "exit", "merge", "intersection")
+OTHER_ROUNDABOUTS = ("roundabout of three lanes", "roundabout of one lane")
+NAMES = (*TRAINING_CONCEPTS, "roundabout", "roundabout third exit", *OTHER_ROUNDABOUTS)
 """Scenario names; scenes contain the index."""
 
 
 def check_simulator() -> None:
-    """Check that highway-env is installed.
-
-    Raises:
-        UserError: with the command that installs it.
-    """
+    """Check that highway-env is installed; the ``UserError`` has the command that installs it."""
     check_extra("driving", f"domain {NAME}: its simulator")
 
 
 def check_scenario(name: str) -> str:
-    """Return the name if it is a scenario's.
-
-    Raises:
-        UserError: for an unknown name.
-    """
-    if name not in DECISIONS:
-        raise UserError(f"driving task: expected one of {', '.join(NAMES)}, found {name!r}")
+    """Return the name of a scenario; raise a ``UserError`` for any other."""
+    require(name in NAMES, "driving task", f"one of {', '.join(NAMES)}", repr(name))
     return name
 
 
 def decision_seconds(name: str) -> float:
-    """Seconds between decisions of a scenario.
-
-    Raises:
-        UserError: for an unknown name.
-    """
-    return 1 / DECISIONS[check_scenario(name)]
+    """Seconds between decisions of a scenario; raises a ``UserError`` for an unknown name."""
+    return 0.5 if check_scenario(name) == "intersection" else 1.0
 
 
 def episode_seed(seed: int, number: int) -> int:
@@ -104,9 +87,73 @@ def origin(given: NDArray[np.float32]) -> tuple[str, int]:
     Raises:
         UserError: for a wrong size, or numbers that are not a scenario and seed.
     """
-    if given.shape != (SCENE,) or not np.isfinite(given).all():
-        raise UserError(f"driving scene: expected {SCENE} finite numbers, found shape {given.shape}")
+    numbers = given.shape == (SCENE,) and np.isfinite(given).all()
+    require(numbers, "driving scene", f"{SCENE} finite numbers", f"shape {given.shape}")
     number, seed = given[OBSERVED:].tolist()
-    if number not in range(len(NAMES)) or not (0 <= seed < SEEDS and seed == int(seed)):
-        raise UserError(f"driving scene: expected a scenario from 0 to {len(NAMES) - 1} and a seed, found {number:g} and {seed:g}")
+    known = number in range(len(NAMES)) and 0 <= seed < SEEDS and seed == int(seed)
+    require(known, "driving scene", f"a scenario from 0 to {len(NAMES) - 1} and a seed", f"{number:g} and {seed:g}")
     return NAMES[int(number)], int(seed)
+
+
+NEW = "new initial state"
+SUITES = {
+    "training": training_suite(TRAINING_CONCEPTS),
+    "paper": Suite((EvaluationTask(NEW, "roundabout", learned=("roundabout",)),)),
+    "validation": Suite((EvaluationTask(NEW, "roundabout third exit", learned=("roundabout third exit",)),)),
+    "other roundabouts": Suite(
+        tuple(EvaluationTask("other roundabout", name, learned=("roundabout",)) for name in OTHER_ROUNDABOUTS)
+    ),
+}
+"""``validation`` is another route through the same roundabout. ``other roundabouts`` have other sizes, for the concept learned in
+the paper's roundabout; they are not used for tuning."""
+
+
+SHIPPED = Path(__file__).parent / "demonstrations"
+"""Folder with a file of expert episodes per training scenario; see its data card."""
+HELD_OUT = 10
+"""Number of validation episodes per scenario, the last of its file."""
+
+
+def training_set(name: Split, count: int, folder: Path | None = None) -> Demonstrations:
+    """The first ``count`` shipped episodes per training scenario; for ``'validation'``, held-out episodes.
+
+    ``folder`` has other episodes, a file per scenario as written by ``generate``.
+
+    Raises:
+        UserError: if there are fewer, or no file.
+    """
+    parts = []
+    for scenario in TRAINING_CONCEPTS:
+        shipped = Demonstrations.load((folder or SHIPPED) / f"{scenario}.safetensors")
+        rows = list(range(len(shipped)))
+        pool = rows[-HELD_OUT:] if name == "validation" else rows[:-HELD_OUT]
+        key = "samples_per_concept" if name == "train" else "validation_per_concept"
+        require(count <= len(pool), f"data.{key}", f"at most {len(pool)} episodes of {scenario!r}", count)
+        parts.append(shipped.rows(pool[:count]))
+    return concatenate(parts)
+
+
+SUCCESS, CRASH = "closed loop success (step veto)", "closed loop crash (step veto)"
+_TABLE = (
+    ("1.2", OURS, 0.18, 0.38),
+    ("1.4", OURS, 0.14, 0.40),
+    ("1.6", OURS, 0.04, 0.48),
+    ("1.8", OURS, 0.10, 0.40),
+    ("learned", OURS, 0.24, 0.32),
+    ("learned", "BC", 0.04, 0.64),
+    ("learned", "CVAE", 0.24, 0.48),
+    ("learned", "in-context", 0.0, 0.16),
+)
+"""Guidance weight, method, success rate and crash rate, of the table 'Classifier-free guidance weight choice effect'."""
+PUBLISHED = (
+    *(
+        Published(NEW, value, omega=omega, metric=metric, method=method)
+        for omega, method, *rates in _TABLE
+        for metric, value in zip((SUCCESS, CRASH), rates, strict=True)
+    ),
+    Published(NEW, 0.14, components=1, metric=SUCCESS),  # table 'Ablation on the number of learned concepts', K = 1
+)
+"""The paper's results, comparable with ours for one-step look-ahead.
+
+The success rate counts any vehicle past the roundabout, crashed or not.
+"""

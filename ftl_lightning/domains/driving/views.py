@@ -5,10 +5,47 @@ from torch import Tensor
 
 from ftl_lightning.data.features import Observed
 from ftl_lightning.domains.domain import View
-from ftl_lightning.domains.driving.motion import drive, speed, turn, turned, way
-from ftl_lightning.domains.driving.tasks import TRAINING_CONCEPTS
-from ftl_lightning.domains.driving.traffic import FEATURES_SEEN, NAMES, SCENARIO, STATE, TRAFFIC, VEHICLES, decision_seconds
+from ftl_lightning.domains.driving.traffic import (
+    FEATURES_SEEN,
+    NAMES,
+    SCENARIO,
+    STATE,
+    TRAFFIC,
+    TRAINING_CONCEPTS,
+    VEHICLES,
+    decision_seconds,
+)
 from ftl_lightning.services.processes import drawn
+
+
+def turned(pairs: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
+    """Rotate ``(..., 2)`` by an angle."""
+    x, y = pairs.unbind(-1)
+    return torch.stack((cos * x - sin * y, sin * x + cos * y), dim=-1)
+
+
+def speed(states: Tensor) -> Tensor:
+    """Velocity ``(..., 2)`` along and across the heading in m/s."""
+    return turned(states[..., 3:5], states[..., 5], -states[..., 6])
+
+
+def turn(before: Tensor, after: Tensor) -> Tensor:
+    """Cosine and sine ``(..., 2)`` of the rotation between the headings."""
+    return turned(after[..., 5:7], before[..., 5], -before[..., 6])
+
+
+def way(before: Tensor, after: Tensor) -> Tensor:
+    """Metres ``(..., 2)`` along and across the mean heading; on a curve: nearly its length, and 0."""
+    seen = turned(after[..., 1:3] - before[..., 1:3], before[..., 5], -before[..., 6])
+    cos, sin = turn(before, after).unbind(-1)
+    half = torch.atan2(sin, cos) / 2
+    return turned(seen, half.cos(), -half.sin())
+
+
+def drive(before: Tensor, after: Tensor) -> Tensor:
+    """Displacement and final velocity ``(..., 4)``: the driver's decision, independent of the road's direction."""
+    return torch.cat((way(before, after), speed(after)), dim=-1)
+
 
 SECONDS = torch.tensor([decision_seconds(name) for name in NAMES])
 """Seconds between decisions by scenario number."""
@@ -25,14 +62,6 @@ def _vehicles(observed: Observed) -> Tensor:
     return observed[TRAFFIC].unflatten(-1, (VEHICLES, STATE))
 
 
-def _seen_from(states: Tensor, ego: Tensor) -> Tensor:
-    """States ``(sample, n, 7)`` in the frame of a vehicle ``(sample, 7)``."""
-    cos, sin = ego[:, None, 5], ego[:, None, 6]
-    presence, place, velocity, heading = states.split((1, 2, 2, 2), dim=-1)
-    parts = (place - ego[:, None, 1:3], velocity, heading)
-    return torch.cat((presence, *(turned(part, cos, -sin) for part in parts)), dim=-1)
-
-
 def _near(places: Tensor) -> Tensor:
     """Compress large distances ``(..., n)``."""
     return places * NEAR / (NEAR + places.norm(dim=-1, keepdim=True))
@@ -45,8 +74,9 @@ def _observe_from_ego(observed: Observed) -> Observed:
     """
     vehicles = _vehicles(observed)
     ego, others = vehicles[:, 0], vehicles[:, 1:]
-    seen = _seen_from(others, ego)
-    presence, place, velocity, heading = seen.split((1, 2, 2, 2), dim=-1)
+    presence, *parts = others.split((1, 2, 2, 2), dim=-1)
+    parts[0] = parts[0] - ego[:, None, 1:3]
+    place, velocity, heading = (turned(part, ego[:, None, 5], -ego[:, None, 6]) for part in parts)
     seen = torch.cat((presence, _near(place), velocity - speed(ego)[:, None], heading), dim=-1) * presence
     pose = torch.cat((ego[:, 1:3], _near(ego[:, 1:2]), _near(ego[:, 2:3]), ego[:, 5:]), dim=-1) * _known(observed)
     return {TRAFFIC: torch.cat((pose[:, :4], ego[:, 3:5].norm(dim=-1, keepdim=True), pose[:, 4:], seen.flatten(1)), dim=-1)}

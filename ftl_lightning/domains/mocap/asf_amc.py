@@ -7,14 +7,14 @@ named XYZ apply x first: ``Rz Ry Rx``.
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.errors import UserError, require
 from ftl_lightning.services.limits import most_bytes, read_text
 
 INCH = 0.0254
@@ -28,7 +28,7 @@ JOINT_BONES = (
 THORAX = "thorax"
 _NUMBERS = {"direction": 3, "length": 1, "axis": 3}
 """Count of numbers per key of a bone."""
-_CHANNELS = {"TX", "TY", "TZ", "RX", "RY", "RZ"}
+_CHANNELS = ("TX", "TY", "TZ", "RX", "RY", "RZ")
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ def read_asf(path: Path) -> Skeleton:
     """
     lines = _Lines(path)
     length, degrees = 1.0, True
-    order: tuple[str, ...] = ("TX", "TY", "TZ", "RX", "RY", "RZ")
+    order: tuple[str, ...] = _CHANNELS
     position, angles, root_order = np.zeros(3), np.zeros(3), "XYZ"
     bones: dict[str, Bone] = {}
     parents: dict[str, str] = {}
@@ -118,8 +118,7 @@ def read_asf(path: Path) -> Skeleton:
             degrees = lines.word(words, 1).lower().startswith("deg")
         elif section == ":root" and key == "order":
             order = tuple(word.upper() for word in words[1:])
-            if set(order) != _CHANNELS or len(order) != 6:
-                raise lines.error("TX TY TZ RX RY RZ in some order", words)
+            lines.check(sorted(order) == sorted(_CHANNELS), "TX TY TZ RX RY RZ in some order", words)
         elif section == ":root" and key == "axis":
             root_order = lines.word(words, 1)
         elif section == ":root" and key == "position":
@@ -128,38 +127,34 @@ def read_asf(path: Path) -> Skeleton:
             angles = lines.numbers(words[1:], 3)
         elif section == ":bonedata":
             if key == "end":
-                name, made = _bone(lines, bone, degrees)
-                bones[name] = made
+                bones |= _bone(lines, bone, degrees)
             elif key in _NUMBERS:
                 lines.numbers(words[1 : 1 + _NUMBERS[key]], _NUMBERS[key])
             bone = {} if key in ("begin", "end") else bone | {key: words[1:]}
         elif section == ":hierarchy" and key not in ("begin", "end"):
             parents |= dict.fromkeys(words[1:], words[0])
-    if length <= 0:
-        raise UserError(f"{path}: key 'length': expected a positive number, found {length:g}")
-    if missing := [name for name in JOINT_BONES if name not in bones]:
-        raise UserError(f"{path}: expected a skeleton of the CMU database, found one without the bone {missing[0]!r}")
+    require(length > 0, f"{path}: key 'length'", "a positive number", f"{length:g}")
+    for name in JOINT_BONES:
+        require(name in bones, str(path), "a skeleton of the CMU database", f"a skeleton without the bone {name!r}")
     orientation = _rest(lines, angles, root_order, degrees)
     return Skeleton(INCH / length, order, position, orientation, _ordered(path, bones, parents))
 
 
-def _bone(lines: "_Lines", fields: dict[str, list[str]], degrees: bool) -> tuple[str, Bone]:
+def _bone(lines: "_Lines", fields: dict[str, list[str]], degrees: bool) -> dict[str, Bone]:
     for key in ("name", "direction", "length", "axis"):
-        if key not in fields:
-            raise lines.error(f"a bone with name, direction, length and axis (no {key!r} here)", ["end"])
+        lines.check(key in fields, f"a bone with name, direction, length and axis (no {key!r} here)", ["end"])
     direction = lines.numbers(fields["direction"], 3)
     norm = float(np.linalg.norm(direction))
     turn = _rest(lines, lines.numbers(fields["axis"][:3], 3), lines.word(fields["axis"], 3), degrees)
     dof = tuple(word.lower() for word in fields.get("dof", ()))
-    if unknown := set(dof) - {"rx", "ry", "rz"}:
-        raise lines.error("degrees of freedom rx, ry or rz", sorted(unknown))
+    unknown = sorted(set(dof) - {"rx", "ry", "rz"})
+    lines.check(not unknown, "degrees of freedom rx, ry or rz", unknown)
     reach = direction * (lines.number(fields["length"], 0) / norm if norm > 0 else 0.0)
-    return lines.word(fields["name"], 0), Bone(ROOT, reach, turn, dof)
+    return {lines.word(fields["name"], 0): Bone(ROOT, reach, turn, dof)}
 
 
 def _rest(lines: "_Lines", angles: NDArray[np.float64], order: str, degrees: bool) -> Rotation:
-    if sorted(order.lower()) != ["x", "y", "z"]:
-        raise lines.error("an order of axes such as XYZ", [order])
+    lines.check(sorted(order.lower()) == ["x", "y", "z"], "an order of axes such as XYZ", [order])
     by_axis = dict(zip("xyz", angles, strict=True))
     return Rotation.from_euler(order.lower(), [by_axis[letter] for letter in order.lower()], degrees=degrees)
 
@@ -169,12 +164,9 @@ def _ordered(path: Path, bones: dict[str, Bone], parents: dict[str, str]) -> dic
     ordered: dict[str, Bone] = {}
     while len(ordered) < len(bones):
         ready = [name for name in bones if name not in ordered and (parents.get(name) == ROOT or parents.get(name) in ordered)]
-        if not ready:
-            lost = next(name for name in bones if name not in ordered)
-            raise UserError(f"{path}: section ':hierarchy': expected what {lost!r} hangs on, up to the root, found no such bones")
-        for name in ready:
-            bone = bones[name]
-            ordered[name] = Bone(parents[name], bone.reach, bone.axis, bone.dof)
+        lost = next(name for name in bones if name not in ordered)
+        require(ready, f"{path}: section ':hierarchy'", f"the parents of {lost!r}, up to the root", "no such bones")
+        ordered |= {name: replace(bones[name], parent=parents[name]) for name in ready}
     return ordered
 
 
@@ -197,27 +189,16 @@ def read_amc(path: Path, skeleton: Skeleton) -> dict[str, NDArray[np.float64]]:
             _complete(lines, values, frames)
             frames += 1
             continue
-        if name not in expected:
-            raise lines.error("a bone of the skeleton", [name], "is it of another subject?")
-        if len(words) - 1 != expected[name]:
-            raise lines.error(f"{expected[name]} numbers for {name!r}", words, "is it of another subject?")
+        lines.check(name in expected, "a bone of the skeleton", [name], "; is it of another subject?")
+        count = expected[name]
+        lines.check(len(words) - 1 == count, f"{count} numbers for {name!r}", words, "; is it of another subject?")
         rows = values.setdefault(name, [])
-        if len(rows) != frames - 1:
-            raise lines.error("a frame's number before its bones, and each bone once", words)
-        try:
-            rows.append([float(word) for word in words[1:]])
-        except ValueError:
-            raise lines.error("numbers", words) from None
+        lines.check(len(rows) == frames - 1, "a frame's number before its bones, and each bone once", words)
+        rows.append(lines.floats(words[1:], count))
     _complete(lines, values, frames)
-    if not frames:
-        raise UserError(f"{path}: expected frames of motion, found none")
+    require(frames, str(path), "frames of motion", "none")
+    require(ROOT in values, str(path), "the root's motion", "none")
     motion = {name: np.array(rows) for name, rows in values.items()}
-    for name, array in motion.items():
-        if not np.isfinite(array).all():
-            frame = int((~np.isfinite(array)).any(axis=1).argmax()) + 1
-            raise UserError(f"{path}: frame {frame}: expected finite numbers of {name!r}, found others")
-    if ROOT not in motion:
-        raise UserError(f"{path}: expected the root's motion, found none")
     if scale != 1.0:
         rotations = [place for place, channel in enumerate(skeleton.order) if channel.startswith("R")]
         for name, array in motion.items():
@@ -227,8 +208,7 @@ def read_amc(path: Path, skeleton: Skeleton) -> dict[str, NDArray[np.float64]]:
 
 def _complete(lines: "_Lines", values: dict[str, list[list[float]]], frames: int) -> None:
     for name, rows in values.items():
-        if len(rows) != frames:
-            raise lines.error(f"{name!r} in every frame", [f"frame {frames} without it"])
+        lines.check(len(rows) == frames, f"{name!r} in every frame", [f"frame {frames} without it"])
 
 
 class _Lines:
@@ -241,20 +221,17 @@ class _Lines:
     def __iter__(self) -> Iterator[list[str]]:
         for number, text in enumerate(self.lines, start=1):
             self.line = number
-            words = (text.split("#")[0] if "#" in text else text).split()
-            if words:
+            if words := text.split("#")[0].split():
                 yield words
 
-    def error(self, expected: str, words: Sequence[str], what: str = "") -> UserError:
-        """Error in the line read last."""
-        text = " ".join(words)
-        hint = f"; {what}" if what else ""
-        return UserError(f"{self.path}: line {self.line}: expected {expected}, found {text[:60]!r}{hint}")
+    def check(self, condition: bool, expected: str, words: Sequence[str], hint: str = "") -> None:
+        """Check the line read last."""
+        if not condition:
+            raise UserError(f"{self.path}: line {self.line}: expected {expected}, found {' '.join(words)[:60]!r}{hint}")
 
     def word(self, words: Sequence[str], place: int) -> str:
         """Word at a position."""
-        if len(words) <= place:
-            raise self.error("more words", words)
+        self.check(len(words) > place, "more words", words)
         return words[place]
 
     def number(self, words: Sequence[str], place: int) -> float:
@@ -262,11 +239,14 @@ class _Lines:
         return float(self.numbers([self.word(words, place)], 1)[0])
 
     def numbers(self, words: Sequence[str], count: int) -> NDArray[np.float64]:
+        return np.array(self.floats(words, count))
+
+    def floats(self, words: Sequence[str], count: int) -> list[float]:
         """Words as ``count`` finite numbers."""
         try:
-            values = np.array([float(word) for word in words])
+            values = [float(word) for word in words]
         except ValueError:
-            raise self.error("numbers", words) from None
-        if len(values) != count or not np.isfinite(values).all():
-            raise self.error(f"{count} finite numbers", words)
+            values = []
+        expected = "a finite number" if count == 1 else f"{count} finite numbers"
+        self.check(len(values) == count and all(map(math.isfinite, values)), expected, words)
         return values

@@ -1,7 +1,8 @@
 """Motion features of the judge.
 
-Joints are relative to their parents, in units of body size, with velocities: features are invariant to body size and tell frozen
-or trembling motion from real motion.
+Joints are relative to their parents, in units of body size, with velocities: features are invariant to body size and distinguish
+frozen or trembling motion from real motion. Arguments are windows ``(sample, frame, 42)`` and the visible joints: :data:`LOWER`,
+:data:`UPPER` or all.
 """
 
 from collections.abc import Sequence
@@ -51,10 +52,7 @@ def _in_sizes(states: Tensor) -> Tensor:
 
 
 def signals(states: Tensor, joints: Sequence[int]) -> Tensor:
-    """Time series for a network: ``(sample, 9 * joints, frame)`` for windows ``(sample, frame, 42)``.
-
-    Bones and positions in body sizes, and velocities in body sizes per third of a second.
-    """
+    """Time series for a network ``(sample, 9 * joints, frame)``: bones, positions, and velocities per third of a second."""
     relative = _in_sizes(states)
     where = places(relative)
     velocity = torch.diff(where, dim=1) * (FPS / 3)
@@ -201,12 +199,7 @@ def _arms_and_legs(where: Tensor) -> list[Tensor]:
 
 
 def summary(states: Tensor, joints: Sequence[int]) -> Tensor:
-    """Window features for a linear classifier, invariant to mirroring: ``(sample, feature)``.
-
-    Args:
-        states: windows ``(sample, frame, 42)``.
-        joints: :data:`LOWER`, :data:`UPPER` or all; others are ignored.
-    """
+    """Window features for a linear classifier, invariant to mirroring: ``(sample, feature)``."""
     limbs = _in_sizes(states)
     where = places(limbs)
     right = [joint for joint in (RK, RA, RS, RE, RW) if joint in joints]
@@ -231,10 +224,6 @@ def turns(states: Tensor, joints: Sequence[int]) -> Tensor:
     """Roundness of joint paths, invariant to mirroring: ``(sample, feature)``.
 
     A path to and fro on a line has one extent and no area; a circle has two equal extents.
-
-    Args:
-        states: windows ``(sample, frame, 42)``.
-        joints: :data:`LOWER`, :data:`UPPER` or all; others are ignored.
     """
     where = places(_in_sizes(states))
     right = [joint for joint in (RK, RA, RE, RW) if joint in joints]
@@ -288,10 +277,6 @@ def extremes(states: Tensor, joints: Sequence[int]) -> Tensor:
     """Fewer window features for a second linear classifier, invariant to mirroring: ``(sample, feature)``.
 
     Extremes of height, distance, flexion and speed, on the more and on the less active side.
-
-    Args:
-        states: windows ``(sample, frame, 42)``.
-        joints: :data:`LOWER`, :data:`UPPER` or all; others are ignored.
     """
     limbs = _in_sizes(states)
     where = places(limbs)

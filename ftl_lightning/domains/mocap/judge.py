@@ -15,10 +15,10 @@ from typing import Any, Self, cast
 import torch
 from torch import Tensor, nn
 
-from ftl_lightning.domains.mocap.actions import CLASSES, LEG_CLASSES, OTHER, STAND, actions, of_legs
 from ftl_lightning.domains.mocap.features import LOWER, UPPER, extremes, signals, summary, turns
 from ftl_lightning.domains.mocap.skeleton import COLUMNS, FPS, HORIZON, as_joints
-from ftl_lightning.services.errors import UserError
+from ftl_lightning.domains.mocap.tasks import CLASSES, LEG_CLASSES, OTHER, STAND, actions, of_legs
+from ftl_lightning.services.errors import UserError, require
 from ftl_lightning.services.shipped import shipped
 from ftl_lightning.services.tensor_file import file_hash, load_tensors, save_tensors
 
@@ -59,12 +59,7 @@ _OUTLIER = 5.0
 
 
 class Network(nn.Module):
-    """Convolutional network over time.
-
-    Args:
-        channels: number of time series, see :func:`~ftl_lightning.domains.mocap.features.signals`.
-        classes: number of classes.
-    """
+    """Convolutional network over the time series of :func:`~ftl_lightning.domains.mocap.features.signals`."""
 
     def __init__(self, channels: int, classes: int) -> None:
         super().__init__()
@@ -88,12 +83,7 @@ class Network(nn.Module):
 
 
 class Verifier(nn.Sequential):
-    """Perceptron on window features: logits ``(sample, class)`` that the window shows a whole action.
-
-    Args:
-        numbers: number of features.
-        classes: number of classes.
-    """
+    """Perceptron on window features: logits ``(sample, class)`` that the window shows a whole action."""
 
     def __init__(self, numbers: int, classes: int) -> None:
         super().__init__(nn.Dropout(0.2), nn.Linear(numbers, VERIFIER), nn.ReLU(), nn.Dropout(0.3), nn.Linear(VERIFIER, classes))
@@ -168,10 +158,7 @@ class Recogniser(nn.Module):
         return scores.masked_fill(excluded & actions_only, -torch.inf)
 
     def verified(self, states: Tensor) -> Tensor:
-        """Mean logits ``(sample, class)`` that a window shows the whole action of a class.
-
-        They are meaningful for the classes of :data:`VERIFIED`.
-        """
+        """Mean logits ``(sample, class)`` that a window shows a whole action; meaningful for :data:`VERIFIED` alone."""
         numbers = self.all_numbers(states)
         return torch.stack([verifier(numbers) for verifier in self.verifiers]).mean(dim=0)
 
@@ -203,12 +190,9 @@ class Judge(nn.Module):
     def __init__(self, members: int = 2) -> None:
         super().__init__()
         self.members = members
-        self.parts = nn.ModuleDict(
-            {
-                name: Recogniser(joints, classes, members, members if name == WHOLE else 0)
-                for name, (joints, classes) in PARTS.items()
-            }
-        )
+        verifiers = {WHOLE: members}
+        parts = {name: Recogniser(*PARTS[name], members, verifiers.get(name, 0)) for name in PARTS}
+        self.parts = nn.ModuleDict(parts)
         self.num_features = EMBEDDING
         self.eval()
 
@@ -235,8 +219,7 @@ class Judge(nn.Module):
             UserError: for a goal without an action.
         """
         names = actions(goal)
-        if not names:
-            raise UserError(f"goal: expected an action that the judge of motion knows, such as 'walk', found {goal!r}")
+        require(names, "goal", "an action that the judge of motion knows, such as 'walk'", repr(goal))
         if len(names) == 1:
             return self.part(WHOLE).says(states, names[0])
         return self.part(ARMS).says(states, names[0]) & self.part(LEGS).says(states, of_legs(names[1]))
@@ -252,21 +235,17 @@ class Judge(nn.Module):
         Raises:
             UserError: for a file that is missing, damaged or of another form.
         """
-        if not Path(path).is_file():
-            raise UserError(
-                f"{path}: expected the judge of motion, found nothing; "
-                "take it from the project's repository, or make it with benchmarks/experiments/mocap_judge.py"
-            )
+        remedy = "take it from the project's repository, or make it with benchmarks/experiments/mocap_judge.py"
+        require(Path(path).is_file(), str(path), "the judge of motion", f"nothing; {remedy}")
         tensors, header = load_tensors(path, KIND)
-        if header.get("classes") != list(CLASSES):
-            raise UserError(f"{path}: key 'classes': expected those of this version, found others; train it again")
+        same = header.get("classes") == list(CLASSES)
+        require(same, f"{path}: key 'classes'", "those of this version", "others; train it again")
         members = header.get("members")
         if not isinstance(members, int) or not 1 <= members <= 100:
             raise UserError(f"{path}: key 'members': expected a number of networks, found {members!r}; train it again")
         judge = cls(members)
-        expected = judge.state_dict()
-        if {name: value.shape for name, value in tensors.items()} != {name: value.shape for name, value in expected.items()}:
-            raise UserError(f"{path}: expected weights of this version's judge, found others; train it again")
+        shapes, expected = ({name: value.shape for name, value in values.items()} for values in (tensors, judge.state_dict()))
+        require(shapes == expected, str(path), "weights of this version's judge", "others; train it again")
         judge.load_state_dict(tensors)
         return judge.requires_grad_(False)
 

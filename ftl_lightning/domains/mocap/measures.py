@@ -1,10 +1,10 @@
-"""Measures of generated motion: action, naturalness, and distance to recordings.
+"""Measures of generated motion: kinematic rules of actions, the judge, naturalness, and distance to recordings.
 
-Domain metrics map ``(goal, states (sample, 32, 42), initial states or None) -> (sample,)``. Other measures compare sets of windows
-by features of the judge, which was trained on neither generated motion nor the generator.
+Rules use joints only, without training, calibrated on recordings (docs/experiments-mocap.md): a second opinion beside the trained
+judge. Trembling motion fails. Domain metrics map ``(goal, states (sample, 32, 42), initial states or None) -> (sample,)``. Other
+measures compare sets of windows by features of the judge, which was trained on neither generated motion nor the generator.
 """
 
-import itertools
 import warnings
 from collections.abc import Callable, Mapping
 
@@ -14,19 +14,177 @@ from torchmetrics.image.fid import FrechetInceptionDistance
 from torchmetrics.image.kid import KernelInceptionDistance
 
 from ftl_lightning.data.features import InitialStates
-from ftl_lightning.domains.mocap import kinematics
 from ftl_lightning.domains.mocap.features import extremes
 from ftl_lightning.domains.mocap.judge import PARTS, WHOLE, Judge, shipped_judge
-from ftl_lightning.domains.mocap.skeleton import BONES, RIGID, SHOULDERS, WRISTS, as_joints, bone_lengths
-from ftl_lightning.services.errors import UserError
+from ftl_lightning.domains.mocap.skeleton import (
+    ANKLES,
+    BONES,
+    FPS,
+    HEAD,
+    HIPS,
+    KNEES,
+    L_ANKLE,
+    NECK,
+    POSE,
+    R_ANKLE,
+    RIGID,
+    SHOULDERS,
+    WRISTS,
+    as_joints,
+    bone_lengths,
+)
+from ftl_lightning.services.errors import require
 from ftl_lightning.services.extras import check_extra
 
-POSE = "pose"
-"""Observed feature of the initial pose."""
+STRIDE = 0.3
+"""Minimum ankle distance in metres of a stride; closer ankles are a level pose."""
+SETTLED = 12
+"""First frame that is independent of the initial pose; synchrony and arm paths are judged from here."""
+OVERHEAD = -0.12
+"""Jumping jacks: minimum height in metres of both wrists at once above the top of the head; bent arms stay a little below it."""
+OPENED, OPEN = 0.2, 0.4
+"""Jumping jacks: minimum range and minimum peak of the sideways distance of the feet, in metres."""
+HANGING = 0.15
+"""Jumping jacks: minimum depth in metres of the hands below the shoulders at some time."""
+IN_TIME = 0.6
+"""Minimum absolute correlation of hand height and foot distance that counts as synchronous, in phase or in antiphase."""
+TURN = 240.0
+"""Minimum rotation of the arms in degrees in an arm circle, as a mean; two thirds for each arm."""
+WIDTH, ROUND = 0.12, 0.2
+"""Minimum width of the wrists' path, in metres and relative to its length, of a round path."""
+RAISED, LOWERED = 0.15, 0.3
+"""Knee raise, in metres below the hips: maximum of a raised knee; minimum of this knee at another time, and of the other knee."""
+BENT, STRETCHED = 70.0, 30.0
+"""Squat, in degrees: minimum flexion of both knees at once, and minimum range of this flexion."""
+TREMBLING = 900.0
+"""Maximum jerk of an action in metres per second cubed: the 99th percentile of recorded windows."""
+UPRIGHT, ON_FEET = 0.35, 0.5
+"""Minimum distances in metres from the hips up to the neck, and down to each ankle, of an upright pose."""
+
+
+def is_stride(poses: Tensor) -> Tensor:
+    """Whether poses ``(sample, 42)`` are strides: ``(sample,)`` of bool."""
+    joints = as_joints(poses)
+    return torch.linalg.vector_norm(joints[:, R_ANKLE] - joints[:, L_ANKLE], dim=-1) > STRIDE
+
+
+def _hands(states: Tensor) -> Tensor:
+    """Mean height of both wrists ``(sample, frame)`` in metres."""
+    return as_joints(states)[..., list(WRISTS), 2].mean(dim=-1)
+
+
+def _feet(states: Tensor) -> Tensor:
+    """Sideways distance of the ankles ``(sample, frame)`` in metres; negative for crossed feet."""
+    joints = as_joints(states)
+    return joints[..., R_ANKLE, 0] - joints[..., L_ANKLE, 0]
+
+
+def _range(values: Tensor) -> Tensor:
+    return values.amax(dim=1) - values.amin(dim=1)
+
+
+def upright(states: Tensor) -> Tensor:
+    """Whether all poses stand or hop upright on both feet: ``(sample,)`` of bool."""
+    height = as_joints(states)[..., 2]
+    return (height[..., NECK] > UPRIGHT).all(dim=1) & (height[..., list(ANKLES)] < -ON_FEET).all(dim=-1).all(dim=1)
+
+
+def mean_jerk(states: Tensor) -> Tensor:
+    """Mean jerk ``(sample,)``: size of the joints' third derivative in metres per second cubed."""
+    third = torch.diff(as_joints(states), n=3, dim=1) * FPS**3
+    return torch.linalg.vector_norm(third, dim=-1).mean(dim=(1, 2))
+
+
+def calm(states: Tensor) -> Tensor:
+    """Whether jerk is below that of recordings: ``(sample,)`` of bool. Jumping joints would pass through any pose."""
+    return mean_jerk(states) < TREMBLING
+
+
+def synchronous(states: Tensor) -> Tensor:
+    """Whether feet open and close in time with the hands, in phase or in antiphase: ``(sample,)`` of bool."""
+    settled = states[:, SETTLED:]
+    hands, feet = (values - values.mean(dim=1, keepdim=True) for values in (_hands(settled), _feet(settled)))
+    size = torch.linalg.vector_norm(hands, dim=1) * torch.linalg.vector_norm(feet, dim=1)
+    together = (hands * feet).sum(dim=1) / size.clamp_min(1e-6)
+    wide = (_range(_feet(settled)) >= OPENED) & (_feet(settled).amax(dim=1) >= OPEN)
+    return (together.abs() >= IN_TIME) & wide
+
+
+def hands_overhead(states: Tensor) -> Tensor:
+    """Whether both hands are overhead at one time, and below the shoulders at another: ``(sample,)`` of bool."""
+    joints = as_joints(states)
+    wrists = joints[..., list(WRISTS), 2]
+    up = wrists.amin(dim=-1) - joints[..., HEAD, 2] > OVERHEAD
+    down = (wrists < joints[..., list(SHOULDERS), 2] - HANGING).all(dim=-1)
+    return up.any(dim=1) & down.any(dim=1)
+
+
+def jumping_jacks(states: Tensor) -> Tensor:
+    """Hands overhead and down, feet open and closed in time with them, upright: ``(sample,)`` of bool."""
+    return hands_overhead(states) & synchronous(states) & upright(states) & calm(states)
+
+
+def _paths(states: Tensor) -> Tensor:
+    """Paths of both wrists from the side, relative to the shoulders, centred: ``(sample, frame, 2, 2)``.
+
+    The centre is that of the frames from :data:`SETTLED` on.
+    """
+    joints = as_joints(states)
+    paths = (joints[..., list(WRISTS), :] - joints[..., list(SHOULDERS), :])[..., 1:]
+    settled = paths[:, SETTLED:]
+    return paths - (settled.amax(dim=1, keepdim=True) + settled.amin(dim=1, keepdim=True)) / 2
+
+
+def arm_rotation(states: Tensor) -> Tensor:
+    """Rotation of each arm about the centre of its wrist's path, from the side: degrees ``(sample, side)``.
+
+    Opposite rotations cancel.
+    """
+    paths = _paths(states)
+    angles = torch.atan2(paths[..., 1], paths[..., 0])
+    steps = torch.remainder(torch.diff(angles, dim=1) + torch.pi, 2 * torch.pi) - torch.pi
+    return torch.rad2deg(steps.sum(dim=1).abs())
+
+
+def arm_circle(states: Tensor) -> Tensor:
+    """Whether upright arms rotate by :data:`TURN` on round paths: ``(sample,)`` of bool."""
+    paths = _paths(states)[:, SETTLED:].transpose(1, 2)
+    size = torch.linalg.svdvals(paths - paths.mean(dim=-2, keepdim=True))  # (sample, side, 2)
+    frames = states.shape[1] - SETTLED
+    width = 8**0.5 * size / frames**0.5  # diameter of a circle
+    wide = (width[..., 1] >= WIDTH) & (size[..., 1] >= ROUND * size[..., 0])
+    turned = arm_rotation(states)
+    return calm(states) & upright(states) & (wide & (turned >= TURN * 2 / 3)).all(dim=-1) & (turned.mean(dim=-1) >= TURN)
+
+
+def knee_raise(states: Tensor) -> Tensor:
+    """Whether a knee is raised, and down at another time: ``(sample,)`` of bool."""
+    below = as_joints(states)[..., list(HIPS), 2] - as_joints(states)[..., list(KNEES), 2]
+    raised = (below < RAISED) & (below.flip(-1) > LOWERED)
+    return (raised.any(dim=1) & (below.amax(dim=1) > LOWERED)).any(dim=-1) & calm(states)
+
+
+def squat(states: Tensor) -> Tensor:
+    """Whether both knees are bent at once, and stretched at another time: ``(sample,)`` of bool."""
+    joints = as_joints(states)
+    thigh = joints[..., list(KNEES), :] - joints[..., list(HIPS), :]
+    shank = joints[..., list(ANKLES), :] - joints[..., list(KNEES), :]
+    bend = torch.rad2deg(torch.arccos(torch.cosine_similarity(thigh, shank, dim=-1).clamp(-1, 1)))
+    both = bend.amin(dim=-1)
+    return (both.amax(dim=1) > BENT) & (_range(both) > STRETCHED) & calm(states)
+
+
+RULES: Mapping[str, Callable[[Tensor], Tensor]] = {
+    "jumping jacks": jumping_jacks,
+    "arm circle": arm_circle,
+    "knee raise": knee_raise,
+    "squat": squat,
+}
+"""Rules of actions by goal, from windows ``(sample, frame, 42)`` to ``(sample,)`` of bool."""
+
+
 ENOUGH = 500
 """Windows per side above which distances of distributions depend more on motion than on the number of windows."""
-JACKS, CIRCLES = ("jumping jacks",), ("arm circle",)
-"""Goals with measures of hands and feet, and of turning arms."""
 _RIGID = [BONES.index(bone) for bone in RIGID]
 
 
@@ -35,19 +193,20 @@ def recognised(goal: str, states: Tensor, starts: InitialStates | None) -> Tenso
     return shipped_judge().recognised(goal, states)
 
 
-def bone_error(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
-    """Mean relative difference of rigid bone lengths from those of the initial state: ``(sample,)``.
+def _first(states: Tensor, starts: InitialStates | None) -> Tensor:
+    """Initial poses ``(sample, 42)``: the given ones, else the first frames."""
+    return states[:, 0] if starts is None else starts.observed[POSE]
 
-    Without initial states, from those of the first frame. Recordings have 0.
-    """
-    first = states[:, 0] if starts is None else starts.observed[POSE]
-    usual = bone_lengths(first)[:, None, _RIGID]
+
+def bone_error(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
+    """Mean relative difference of rigid bone lengths from those of the initial pose: ``(sample,)``; 0 for recordings."""
+    usual = bone_lengths(_first(states, starts))[:, None, _RIGID]
     return ((bone_lengths(states)[..., _RIGID] - usual).abs() / usual.clamp_min(1e-3)).mean(dim=(1, 2))
 
 
 def jerk(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
-    """Mean jerk: ``(sample,)``, see :func:`~ftl_lightning.domains.mocap.kinematics.jerk`."""
-    return kinematics.jerk(states)
+    """Mean jerk: ``(sample,)``, see :func:`~ftl_lightning.domains.mocap.measures.mean_jerk`."""
+    return mean_jerk(states)
 
 
 def rise(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
@@ -61,45 +220,35 @@ def rise(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
     return (low.int().cummax(dim=1).values.bool() & high).any(dim=1)
 
 
-def _nothing(states: Tensor) -> Tensor:
-    return torch.full((len(states),), torch.nan)
-
-
 def rule(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
-    """Whether the goal's rule of :mod:`~ftl_lightning.domains.mocap.kinematics` holds: ``(sample,)`` of 0 and 1.
-
-    NaN for goals without a rule.
-    """
-    return kinematics.RULES[goal](states).float() if goal in kinematics.RULES else _nothing(states)
-
-
-def _first(states: Tensor, starts: InitialStates | None) -> Tensor:
-    return states[:, 0] if starts is None else starts.observed[POSE]
+    """Whether the goal's rule of :data:`RULES` holds: ``(sample,)`` of 0 and 1; NaN for goals without a rule."""
+    return RULES[goal](states).float() if goal in RULES else states.new_full((len(states),), torch.nan)
 
 
 def level(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
     """:func:`rule` for level initial poses; NaN for strides."""
-    return rule(goal, states, starts).masked_fill(kinematics.strides(_first(states, starts)), torch.nan)
+    return rule(goal, states, starts).masked_fill(is_stride(_first(states, starts)), torch.nan)
 
 
 def strides(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
     """:func:`rule` for strides as initial poses; NaN for level poses."""
-    return rule(goal, states, starts).masked_fill(~kinematics.strides(_first(states, starts)), torch.nan)
+    return rule(goal, states, starts).masked_fill(~is_stride(_first(states, starts)), torch.nan)
 
 
-def _limited(goals: tuple[str, ...], measure: Callable[[Tensor], Tensor]) -> Callable[[str, Tensor, InitialStates | None], Tensor]:
-    """Restrict a measure to goals; NaN for others."""
+def _limited(limit: str, measure: Callable[[Tensor], Tensor]) -> Callable[[str, Tensor, InitialStates | None], Tensor]:
+    """Restrict a measure to a goal; NaN for others."""
 
     def measured(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
-        return measure(states).float() if goal in goals else _nothing(states)
+        return measure(states).float() if goal == limit else states.new_full((len(states),), torch.nan)
 
     return measured
 
 
-feet_in_time = _limited(JACKS, kinematics.feet_in_time)
-amplitude_of_hands = _limited(JACKS, kinematics.hands_amplitude)
-amplitude_of_feet = _limited(JACKS, kinematics.feet_amplitude)
-degrees_turned = _limited(CIRCLES, kinematics.degrees_turned)
+feet_in_time = _limited("jumping jacks", synchronous)
+amplitude_of_hands = _limited("jumping jacks", lambda states: _range(_hands(states)))
+amplitude_of_feet = _limited("jumping jacks", lambda states: _range(_feet(states)))
+degrees_turned = _limited("arm circle", lambda states: arm_rotation(states).mean(dim=-1))
+"""Parts of rules: vertical range of the hands and range of the feet's sideways distance in metres, mean rotation of the arms."""
 
 
 def distances(generated: Tensor, real: Tensor, seed: int, judge: Judge | None = None) -> dict[str, float]:
@@ -109,9 +258,8 @@ def distances(generated: Tensor, real: Tensor, seed: int, judge: Judge | None = 
     row of real against real motion. The kernel distance has no such bias.
 
     Args:
-        generated, real: windows ``(sample, 32, 42)``; the larger set is subsampled to the size of the smaller.
-        seed: seed of the subsample.
-        judge: source of features; ``None`` for the shipped judge.
+        generated, real: windows ``(sample, 32, 42)``; a random subset of the larger set is compared.
+        seed, judge: seed of the subset, and source of features, by default the shipped judge.
 
     Returns:
         ``fid``, ``kid`` (times 1,000), and ``number`` of windows per side; below :data:`ENOUGH` the Frechet distance means little.
@@ -121,8 +269,7 @@ def distances(generated: Tensor, real: Tensor, seed: int, judge: Judge | None = 
     """
     judge = judge or shipped_judge()
     number = min(len(generated), len(real))
-    if number < 2:
-        raise UserError(f"distances of motion: expected two windows or more on each side, found {len(generated)} and {len(real)}")
+    require(number > 1, "distances of motion", "two windows or more on each side", f"{len(generated)} and {len(real)}")
     draw = torch.Generator().manual_seed(seed)
     sides = {True: real, False: generated}
     chosen = {is_real: windows[torch.randperm(len(windows), generator=draw)[:number]] for is_real, windows in sides.items()}
@@ -153,8 +300,7 @@ def diversity(states: Tensor, seed: int, pairs: int = 200, judge: Judge | None =
     Raises:
         UserError: for fewer than two windows.
     """
-    if len(states) < 2:
-        raise UserError(f"diversity of motion: expected two windows or more, found {len(states)}")
+    require(len(states) > 1, "diversity of motion", "two windows or more", len(states))
     return float(_mean_distance((judge or shipped_judge())(states), pairs, torch.Generator().manual_seed(seed)))
 
 
@@ -166,8 +312,7 @@ def multimodality(states: Mapping[str, Tensor], seed: int, pairs: int = 20, judg
     """
     draw, judge = torch.Generator().manual_seed(seed), judge or shipped_judge()
     means = [_mean_distance(judge(windows), pairs, draw) for windows in states.values() if len(windows) > 1]
-    if not means:
-        raise UserError("multimodality of motion: expected two windows or more of some goal, found none")
+    require(means, "multimodality of motion", "two windows or more of some goal", "none")
     return float(torch.stack(means).mean())
 
 
@@ -184,35 +329,17 @@ def learned_elsewhere(generated: Mapping[str, Tensor], real: Mapping[str, Tensor
     from sklearn.linear_model import LogisticRegression  # a second to import
 
     names = sorted(generated)
-    if names != sorted(real) or len(names) < 2:
-        raise UserError(
-            f"train on generated, test on real: expected the same two classes or more, found {', '.join(names)} and "
-            f"{', '.join(sorted(real))}"
-        )
+    same = names == sorted(real) and len(names) > 1
+    both = f"{', '.join(names)} and {', '.join(sorted(real))}"
+    require(same, "train on generated, test on real", "the same two classes or more", both)
     joints = PARTS[WHOLE][0]
 
     def numbers(windows: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
-        labels = itertools.chain.from_iterable([index] * len(windows[name]) for index, name in enumerate(names))
-        return extremes(torch.cat([windows[name] for name in names]), joints), torch.tensor(list(labels))
+        labels = torch.arange(len(names)).repeat_interleave(torch.tensor([len(windows[name]) for name in names]))
+        return extremes(torch.cat([windows[name] for name in names]), joints), labels
 
     (inputs, labels), (tested, right) = numbers(generated), numbers(real)
     mean, std = inputs.mean(dim=0), inputs.std(dim=0).clamp_min(0.02)
     classifier = LogisticRegression(C=0.01, max_iter=500).fit(((inputs - mean) / std).clamp(-5, 5).numpy(), labels.numpy())
-    said = torch.from_numpy(classifier.predict(((tested - mean) / std).clamp(-5, 5).numpy()))
-    return float(torch.stack([(said[right == index] == index).float().mean() for index in range(len(names))]).mean())
-
-
-MEASURES: Mapping[str, Callable[[str, Tensor, InitialStates | None], Tensor]] = {
-    "accuracy": recognised,
-    "bone error": bone_error,
-    "jerk": jerk,
-    "rule": rule,
-    "level": level,
-    "strides": strides,
-    "rise": rise,
-    "feet in time": feet_in_time,
-    "amplitude of hands": amplitude_of_hands,
-    "amplitude of feet": amplitude_of_feet,
-    "degrees turned": degrees_turned,
-}
-"""Metrics of plans by name; lower is better for bone error and jerk. ``rise`` to ``degrees turned`` are parts of the rules."""
+    predicted = torch.from_numpy(classifier.predict(((tested - mean) / std).clamp(-5, 5).numpy()))
+    return float(torch.stack([(predicted[right == index] == index).float().mean() for index in range(len(names))]).mean())

@@ -1,27 +1,37 @@
 """Convert a user's copy of the database to the file of recordings. Nothing is downloaded."""
 
 import csv
+import functools
 import json
 import re
 import shutil
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ftl_lightning.domains.mocap.asf_amc import Skeleton, read_amc, read_asf
-from ftl_lightning.domains.mocap.bvh import read_bvh
-from ftl_lightning.domains.mocap.normalise import Poses, every, normalised, z_up
-from ftl_lightning.domains.mocap.recordings import FILE, FILES, THANKS, WHERE, Recordings
-from ftl_lightning.domains.mocap.segments import SEGMENTS, read_segments
-from ftl_lightning.domains.mocap.skeleton import HORIZON, JOINTS, RIGID
-from ftl_lightning.domains.mocap.source import glitches, left_out, pieces, too_short
-from ftl_lightning.domains.mocap.tasks import HELD_OUT, TRAINING_CONCEPTS, cleaned
-from ftl_lightning.services.errors import UserError, short
+from ftl_lightning.data.demonstrations import Demonstrations
+from ftl_lightning.domains.mocap.asf_amc import read_amc, read_asf
+from ftl_lightning.domains.mocap.bvh import CONVERTED, EXPORTED, converted, read_bvh, read_motion
+from ftl_lightning.domains.mocap.skeleton import FPS, HIPS, HORIZON, RIGID, Poses, normalised, z_up
+from ftl_lightning.domains.mocap.source import (
+    FILE,
+    FILES,
+    THANKS,
+    WHERE,
+    Recordings,
+    glitches,
+    moving,
+    pieces,
+    training_pieces,
+    unused_reason,
+    validation_trials,
+)
+from ftl_lightning.domains.mocap.tasks import HELD_OUT, SEGMENTS, TRAINING_CONCEPTS, cleaned, read_segments
+from ftl_lightning.services.errors import UserError, require, short
 from ftl_lightning.services.limits import MOST_TEXT, check_readable
 from ftl_lightning.services.progress import bar
 from ftl_lightning.services.representation import counted
@@ -43,6 +53,11 @@ FLOOR = 0.05
 _TRIAL = re.compile(r"(\d{2,3}_\d{2,3})(?!\d)")
 EXAMPLES = 3
 """Maximum examples printed per reason; the report has all."""
+SAME_RATE = 0.01
+"""Relative difference of frame rates that is rounding."""
+
+
+_skeleton = functools.cache(read_asf)
 
 
 class _Dropped(Exception):
@@ -50,6 +65,12 @@ class _Dropped(Exception):
 
     def __init__(self, reason: str, detail: str = "") -> None:
         self.reason, self.detail = reason, detail
+
+
+def _keep(condition: object, reason: str, detail: str = "") -> None:
+    """Reject a trial unless a condition holds."""
+    if not condition:
+        raise _Dropped(reason, detail)
 
 
 @dataclass
@@ -92,8 +113,8 @@ def _counted(what: str, trials: Mapping[str, Mapping[str, str]]) -> Iterable[str
 def prepare(root: Path | None, out: Path | None = None) -> str:
     """Read a folder with ASF and AMC files of the database, or BVH files, at any depth, and write ``recordings.npz``.
 
-    Also write ``recordings.json``: kept trials, dropped files with reasons, and trials excluded from pretraining with reasons. An
-    existing file of recordings is checked.
+    Also write ``recordings.json``: kept trials, dropped files and trials excluded from pretraining, with reasons. An existing file
+    of recordings is checked.
 
     Args:
         root: the folder, with B. Hahne's index of descriptions (:data:`INDEXES`), and optionally ``segments.csv``.
@@ -107,15 +128,15 @@ def prepare(root: Path | None, out: Path | None = None) -> str:
     """
     if root is None:
         raise UserError(f"root: expected a folder with your copy of the database, found none; {WHERE}")
-    if not root.is_dir():
-        raise UserError(f"root: expected a folder, found {'a file' if root.exists() else 'nothing'} at {short(str(root))}; {WHERE}")
+    present = f"{'a file' if root.exists() else 'nothing'} at {short(str(root))}; {WHERE}"
+    require(root.is_dir(), "root", "a folder", present)
     out = root if out is None else out
     motions = sorted(path for path in root.rglob("*") if path.suffix.lower() in (".amc", ".bvh") and path.is_file())
     ready = next((root / name for name in FILES if (root / name).is_file()), None)
     if ready is not None and ready.name != FILE:  # made elsewhere, not from the files beside it
         motions = []
-    if not motions and ready is None:
-        raise UserError(f"{root}: expected AMC or BVH files, found {'none' if any(root.iterdir()) else 'an empty folder'}; {WHERE}")
+    present = f"{'none' if any(root.iterdir()) else 'an empty folder'}; {WHERE}"
+    require(motions or ready, str(root), "AMC or BVH files", present)
     if (segments := root / SEGMENTS).is_file():
         read_segments(segments)
     report = _Report()
@@ -145,8 +166,7 @@ def _read(root: Path, motions: list[Path], report: _Report) -> Recordings:
             else:
                 report.dropped.pop(trial, None)
                 try:
-                    if named is None:
-                        raise _Dropped("file not named after a trial, such as 13_29.amc")
+                    _keep(named, "file not named after a trial, such as 13_29.amc")
                     poses[trial] = _trial(path, trial, descriptions.get(trial, ""), skeletons)
                     report.files[trial] = path.name
                 except _Dropped as dropped:
@@ -155,7 +175,7 @@ def _read(root: Path, motions: list[Path], report: _Report) -> Recordings:
     if not poses:
         name, first = next(iter(report.dropped.items()))
         detail = ": ".join(text for text in (name, first["reason"], first["told"]) if text)
-        raise UserError(f"{root}: expected a trial that can be used, found none of {len(motions)}; {detail}")
+        raise UserError(f"{root}: expected a valid trial, found none of {len(motions)}; {detail}")
     trials = sorted(poses)
     ends = np.cumsum([0, *(len(poses[trial][0].positions) for trial in trials)])
     return Recordings(
@@ -171,14 +191,11 @@ def _read(root: Path, motions: list[Path], report: _Report) -> Recordings:
 
 def _trial(path: Path, trial: str, label: str, skeletons: Mapping[str, Path]) -> tuple[Poses, str]:
     """Read poses and kind of a trial."""
-    if label in ("", "unknown"):
-        raise _Dropped("no description in the index")
-    if label not in TRAINING_CONCEPTS and trial not in HELD_OUT:
-        raise _Dropped("description that is no training concept", label)
     subject = trial.split("_")[0]
     amc, known = path.suffix.lower() == ".amc", subject in skeletons
-    if amc and not known:
-        raise _Dropped("no skeleton of the subject", f"{subject}.asf")
+    _keep(label not in ("", "unknown"), "no description in the index")
+    _keep(label in TRAINING_CONCEPTS or trial in HELD_OUT, "description that is no training concept", label)
+    _keep(known or not amc, "no skeleton of the subject", f"{subject}.asf")
     try:
         skeleton = _skeleton(skeletons[subject]) if known else None
         if amc and skeleton is not None:
@@ -189,47 +206,36 @@ def _trial(path: Path, trial: str, label: str, skeletons: Mapping[str, Path]) ->
             kind = "bvh_mb" if known else "bvh_mb_thx"
     except UserError as error:
         raise _Dropped("cannot be read", str(error)) from None
-    joints = _from_the_floor(z_up(joints))
-    if len(joints) < MIN_RAW_FRAMES:
-        raise _Dropped(f"shorter than {MIN_RAW_FRAMES} frames", f"{len(joints)} frames")
-    if (spread := _spread(joints)) > MAX_SPREAD:
-        raise _Dropped("bones that change their length", f"by {1000 * spread:.1f} mm")
-    poses = normalised(joints[:: every(60 if subject in SLOW else raw_fps)])
-    if not pieces(_states(poses)):
-        raise _Dropped(f"less than {HORIZON} frames without glitches", f"of {len(poses.positions)}")
+    joints = z_up(joints)
+    above = joints[:, HIPS, 2].mean(axis=1) > FLOOR
+    joints = joints[above.argmax() :] if above.any() else joints[:0]
+    _keep(len(joints) >= MIN_RAW_FRAMES, f"shorter than {MIN_RAW_FRAMES} frames", f"{len(joints)} frames")
+    spread = _spread(joints)
+    _keep(spread <= MAX_SPREAD, "bones that change their length", f"by {1000 * spread:.1f} mm")
+    poses = normalised(joints[:: max(1, round((60 if subject in SLOW else raw_fps) / FPS))])
+    _keep(pieces(poses.states), f"less than {HORIZON} frames without glitches", f"of {len(poses.positions)}")
     return poses, kind
-
-
-def _states(poses: Poses) -> NDArray[np.float32]:
-    return poses.positions.astype(np.float32).reshape(-1, 3 * len(JOINTS))
 
 
 def _list(recordings: Recordings, report: _Report) -> None:
     """Report kept trials, and exclusions from pretraining."""
-    reasons = left_out(recordings)
+    training = training_pieces(recordings)
+    validation, used = validation_trials(training), {piece.trial for piece in training}
     for number, trial in enumerate(recordings.trial_id):
         name, states = trial if trial not in report.kept else f"{trial} ({number})", recordings.trial(number)
+        lengths = np.diff((0, *glitches(states), len(states)))
+        short = "" if number in used else f"no piece of {HORIZON} frames without glitches"
+        held_out = "held out for validation" if number in validation else ""
         report.kept[name] = {
             "label": recordings.label[number],
             "kind": recordings.kind[number],
             "file": report.files.get(trial, ""),
             "frames": len(states),
-            "glitches": len(glitches(states)),
-            "too short": too_short(states),
+            "glitches": len(lengths) - 1,
+            "too short": int(lengths[lengths < HORIZON].sum()),
         }
-        if reason := reasons.get(number):
+        if reason := unused_reason(recordings, number) or short or held_out:
             report.left_out[name] = {"reason": reason, "told": recordings.label[number]}
-
-
-@cache
-def _skeleton(path: Path) -> Skeleton:
-    return read_asf(path)
-
-
-def _from_the_floor(joints: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Frames from the first with hips above the floor."""
-    above = np.flatnonzero(joints[:, :4:3, 2].mean(axis=1) > FLOOR)
-    return joints[above[0] :] if len(above) else joints[:0]
 
 
 def _spread(joints: NDArray[np.float64]) -> float:
@@ -255,6 +261,41 @@ def _index(root: Path) -> dict[str, str]:
     lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
     rows = csv.reader(lines) if path.suffix == ".csv" else (line.split("\t") for line in lines)
     descriptions = {row[0].strip(): cleaned(row[1]) for row in rows if len(row) > 1 and _TRIAL.fullmatch(row[0].strip())}
-    if not descriptions:
-        raise UserError(f"{path}: expected lines such as '13_29,description', found none")
+    require(descriptions, str(path), "lines such as '13_29,description'", "none")
     return descriptions
+
+
+def demonstrated(path: Path) -> Demonstrations:
+    """Demonstrations from the motion of a file, without text: each a piece without glitches, as for recordings.
+
+    Args:
+        path: file of ``sample --export``, at any frame rate, or of the conversion.
+
+    Raises:
+        UserError: with the path, for a file that is damaged, of another skeleton, or shorter than a plan.
+    """
+    motion = read_motion(path)
+    if motion.names.issuperset(CONVERTED):
+        joints = converted(motion, None)
+    else:
+        expected = "a skeleton of 'sample --export', or of the MotionBuilder-friendly conversion of the CMU database"
+        for name in EXPORTED:
+            require(name in motion.names, str(path), expected, f"a skeleton without {name!r}")
+        joints = motion.places(EXPORTED)
+    states = normalised(z_up(_at_rate(joints, motion.seconds))).states
+    parts = pieces(states)
+    expected = f"a motion of {HORIZON} frames or more at {FPS} a second, without jumps"
+    require(parts, str(path), expected, f"{len(states)} frames")
+    return moving(parts, [""] * len(parts), {"generator": "BVH file", "file": path.name})
+
+
+def _at_rate(joints: NDArray[np.float64], seconds: float) -> NDArray[np.float64]:
+    """Joints ``(frame, 14, 3)`` resampled to :data:`FPS` by linear interpolation."""
+    step = 1 / FPS / seconds
+    whole = max(round(step), 1)
+    step = whole if abs(step - whole) < SAME_RATE * whole else step
+    times = np.arange(0, len(joints) - 1 + 1e-9, step)
+    before = np.minimum(times.astype(int), max(len(joints) - 2, 0))
+    after = np.minimum(before + 1, len(joints) - 1)
+    part = (times - before)[:, None, None]
+    return joints[before] * (1 - part) + joints[after] * part

@@ -4,8 +4,17 @@ Joints are those of the paper's renderer (jutanke/mocap); the last two are the e
 middle of the hips is the origin, z is up, +y is where the hips face and +x the person's right.
 """
 
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
+
+from ftl_lightning.data.features import Feature
+from ftl_lightning.services.tensor_file import load_tensors, save_tensors
 
 JOINTS = (
     "RHip", "RKnee", "RAnkle", "LHip", "LKnee", "LAnkle", "RShoulder", "RElbow", "RWrist", "LShoulder", "LElbow", "LWrist", "Neck",
@@ -13,6 +22,10 @@ JOINTS = (
 )  # fmt: skip
 COLUMNS = tuple(f"{joint}.{axis}" for joint in JOINTS for axis in "xyz")
 """Columns of a state, in metres."""
+NAME = "mocap"
+POSE = "pose"
+"""Observed feature: the joints at the start of a plan, which are the plan's first state."""
+OBSERVED = {POSE: Feature((len(COLUMNS),), state=tuple(range(len(COLUMNS))))}
 FPS = 30
 """Frames per second."""
 HORIZON = 32
@@ -67,3 +80,113 @@ def bone_lengths(states: Tensor) -> Tensor:
     joints = as_joints(states)
     ends = torch.tensor(BONES).T
     return torch.linalg.vector_norm(joints[..., ends[0], :] - joints[..., ends[1], :], dim=-1)
+
+
+class Poses(NamedTuple):
+    """Poses and removed root motion.
+
+    Attributes:
+        positions: ``(frame, 14, 3)`` in metres, z up, the middle of the hips at the origin, hips facing +y.
+        root: ``(frame, 4)``: middle of the hips in metres, and yaw in radians.
+    """
+
+    positions: NDArray[np.float64]
+    root: NDArray[np.float64]
+
+    @property
+    def states(self) -> NDArray[np.float32]:
+        """States ``(frame, 42)``."""
+        return self.positions.astype(np.float32).reshape(-1, len(COLUMNS))
+
+
+def z_up(joints: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Convert points ``(..., 3)`` from y up to z up."""
+    return np.stack((joints[..., 0], -joints[..., 2], joints[..., 1]), axis=-1)
+
+
+def normalised(joints: NDArray[np.float64]) -> Poses:
+    """Remove root and yaw in every frame of joints ``(frame, 14, 3)``, z up: the direction from left to right hip is +x.
+
+    The yaw of vertical hips means little and may spin; pitch and roll stay.
+    """
+    middle = (joints[:, R_HIP] + joints[:, L_HIP]) / 2
+    across = joints[:, R_HIP] - joints[:, L_HIP]
+    yaw = np.arctan2(across[:, 1], across[:, 0])
+    cosine, sine = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
+    x, y, z = np.moveaxis(joints - middle[:, None], -1, 0)
+    turned = np.stack((cosine * x + sine * y, cosine * y - sine * x, z), axis=-1)
+    return Poses(turned, np.concatenate((middle, yaw[:, None]), axis=1))
+
+
+_RIGHT_SIDE = (
+    (0.09, 0.0, 0.0),
+    (0.09, 0.02, -0.40),
+    (0.09, -0.03, -0.83),
+    (0.18, 0.01, 0.51),
+    (0.21, -0.04, 0.22),
+    (0.22, 0.03, 0.05),
+)
+"""Hip, knee, ankle, shoulder, elbow, wrist in metres, of an adult of medium size."""
+_MIDDLE = ((0.0, 0.02, 0.55), (0.0, 0.07, 0.73))
+STRIDE = 0.4
+"""Maximum angle in radians of a leg forwards or back."""
+SWING = 0.8
+"""Swing of the arm relative to the leg of the same side, in the opposite direction."""
+BEND = 0.15
+"""Radians by which thighs point further forwards, and shanks further back."""
+
+BEGINNINGS = "distribution of poses"
+_FILE = Path(__file__).parent / "beginnings.safetensors"
+
+
+def standing_poses(count: int, draw: torch.Generator) -> Tensor:
+    """Standing poses ``(count, 42)`` of people of different sizes, with arms down."""
+    right = torch.tensor(_RIGHT_SIDE)
+    left = right * torch.tensor((-1.0, 1.0, 1.0))
+    body = torch.cat((right[:3], left[:3], right[3:], left[3:], torch.tensor(_MIDDLE)))
+    size = 1 + 0.05 * (2 * torch.rand(count, 1, 1, generator=draw) - 1)
+    return (body * size).reshape(count, len(COLUMNS))
+
+
+def walking_poses(count: int, draw: torch.Generator) -> Tensor:
+    """Walking poses ``(count, 42)`` of the same people, with strides from zero to the maximum."""
+    joints = as_joints(standing_poses(count, draw)).clone()
+    stride = STRIDE * (2 * torch.rand(count, generator=draw) - 1)
+    sides = ((R_HIP, R_SHOULDER, stride), (L_HIP, L_SHOULDER, -stride))
+    for hip, shoulder, angle in sides:  # joints of a limb are consecutive
+        _turned(joints, (hip, hip + 1, hip + 2), angle + BEND)
+        _turned(joints, (hip + 1, hip + 2), -torch.full_like(angle, 2 * BEND))
+        _turned(joints, (shoulder, shoulder + 1, shoulder + 2), -SWING * angle)
+    return joints.flatten(1)
+
+
+def _turned(joints: Tensor, limb: tuple[int, ...], angle: Tensor) -> None:
+    """Rotate a limb about its first joint forwards by angles ``(pose,)`` in radians, in place."""
+    first, *others = limb
+    cos, sin = angle.cos()[:, None], angle.sin()[:, None]
+    hanging = joints[:, others] - joints[:, first : first + 1]
+    y, z = hanging[..., 1], hanging[..., 2]
+    turned = torch.stack((hanging[..., 0], y * cos - z * sin, y * sin + z * cos), dim=-1)
+    joints[:, others] = joints[:, first : first + 1] + turned
+
+
+def fit_poses(poses: Tensor, directions: int, path: Path) -> None:
+    """Write the Gaussian of :func:`drawn_poses`: mean and principal directions of poses ``(pose, 42)`` in metres."""
+    mean = poses.double().mean(dim=0)
+    _, size, axes = torch.linalg.svd(poses.double() - mean, full_matrices=False)
+    scaled = axes[:directions] * size[:directions, None] / (len(poses) - 1) ** 0.5
+    save_tensors(path, BEGINNINGS, {"mean": mean.float(), "directions": scaled.float()}, {"poses": len(poses)})
+
+
+def drawn_poses(count: int, draw: torch.Generator) -> Tensor:
+    """Samples ``(count, 42)`` of the shipped Gaussian, in metres, on the generator's device."""
+    mean, directions = _distribution()
+    return mean.to(draw.device) + torch.randn((count, len(directions)), generator=draw, device=draw.device) @ directions.to(
+        draw.device
+    )
+
+
+@cache
+def _distribution() -> tuple[Tensor, Tensor]:
+    tensors, _ = load_tensors(_FILE, BEGINNINGS)
+    return tensors["mean"], tensors["directions"]

@@ -1,10 +1,13 @@
-"""Demonstrations from a folder of recordings."""
+"""Recordings of a folder, and demonstrations from them."""
 
+import zipfile
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import pairwise
 from pathlib import Path
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -12,21 +15,151 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ftl_lightning.data.demonstrations import Demonstrations, padded
-from ftl_lightning.data.features import Feature, InitialStates
+from ftl_lightning.data.features import InitialStates
+from ftl_lightning.data.formats.files import check_arrays
 from ftl_lightning.domains.domain import Split
-from ftl_lightning.domains.mocap import skeleton
-from ftl_lightning.domains.mocap.recordings import WHERE, Recordings, read_folder
-from ftl_lightning.domains.mocap.segments import Segment
-from ftl_lightning.domains.mocap.skeleton import COLUMNS, FPS, HORIZON, as_joints, mirrored
-from ftl_lightning.domains.mocap.standing import standing_poses, walking_poses
-from ftl_lightning.domains.mocap.tasks import DEMONSTRATORS, HELD_OUT, NEW_CONCEPTS, TRAINING_CONCEPTS, mirrored_text
-from ftl_lightning.services.errors import UserError
+from ftl_lightning.domains.mocap.skeleton import (
+    ANKLES,
+    COLUMNS,
+    FPS,
+    HIPS,
+    HORIZON,
+    JOINTS,
+    NAME,
+    POSE,
+    SHOULDERS,
+    WRISTS,
+    as_joints,
+    mirrored,
+    standing_poses,
+    walking_poses,
+)
+from ftl_lightning.domains.mocap.tasks import (
+    DEMONSTRATORS,
+    HELD_OUT,
+    NEW_CONCEPTS,
+    SEGMENTS,
+    SHIPPED,
+    TRAINING_CONCEPTS,
+    Segment,
+    cleaned,
+    mirrored_text,
+    read_segments,
+)
+from ftl_lightning.services.errors import UserError, require, short
+from ftl_lightning.services.limits import check_readable
 from ftl_lightning.services.seeding import generator, task_key
+from ftl_lightning.services.tensor_file import atomic
 
-NAME = "mocap"
-POSE = "pose"
-"""Observed feature: the joints at the start of a plan, which are the plan's first state."""
-OBSERVED = {POSE: Feature((len(COLUMNS),), state=tuple(range(len(COLUMNS))))}
+FILE = "recordings.npz"
+FILES = (FILE, "cmu14_trials.npz")
+"""Names of a file of recordings: the output of ``prepare``, or another file with the same content. The first existing is read."""
+WHERE = (
+    "get the CMU motion capture database (mocap.cs.cmu.edu, the files of allasfamc.zip) and run: "
+    "python -m ftl_lightning prepare mocap --root FOLDER"
+)
+THANKS = (
+    "The data used in this project was obtained from mocap.cs.cmu.edu. The database was created with funding from NSF EIA-0196217."
+)
+"""Acknowledgement requested by the database."""
+
+
+@dataclass(frozen=True)
+class Recordings:
+    """Concatenated trials.
+
+    Attributes:
+        positions: ``(frame, 14, 3)`` in metres, see :mod:`ftl_lightning.domains.mocap.skeleton`.
+        root: ``(frame, 4)``: middle of the hips (x, y, z in metres) and yaw in radians.
+        offsets: ``(trial + 1,)``: trial i has the frames ``offsets[i]:offsets[i + 1]``.
+        trial_id, label, kind, subject: of each trial: such as ``13_29``; cleaned description; source format, such as ``asf_amc``;
+            such as ``13``.
+    """
+
+    positions: NDArray[np.float32]
+    root: NDArray[np.float32]
+    offsets: NDArray[np.int64]
+    trial_id: tuple[str, ...]
+    label: tuple[str, ...]
+    kind: tuple[str, ...]
+    subject: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.trial_id)
+
+    def trial(self, number: int) -> NDArray[np.float32]:
+        """States ``(frame, 42)`` of a trial."""
+        return self.positions[self.offsets[number] : self.offsets[number + 1]].reshape(-1, 3 * len(JOINTS))
+
+    def save(self, path: Path) -> None:
+        """Write the recordings atomically."""
+        arrays: dict[str, Any] = {key: np.array(getattr(self, key)) for key in _KEYS}
+        with atomic(path) as temporary, temporary.open("wb") as file:
+            np.savez_compressed(file, **arrays)
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read recordings.
+
+        Raises:
+            UserError: with path and key, for a file that is damaged or of other content.
+        """
+        size = check_readable(path, "recordings")
+        try:
+            check_arrays(path, size)
+            with np.load(path, allow_pickle=False) as archive:
+                arrays = {name: archive[name] for name in archive.files if name in _KEYS}
+        except (OSError, ValueError, EOFError, AttributeError, TypeError, zipfile.BadZipFile, zlib.error) as error:
+            raise UserError(f"{path}: expected recordings, found a damaged or foreign file ({error}); {WHERE}") from error
+        arrays.setdefault("subject", np.array([str(trial).split("_")[0] for trial in arrays.get("trial_id", ())]))
+        _check(path, arrays)
+        texts = {key: tuple(map(str, arrays[key])) for key in _TEXTS}
+        return cls(
+            np.ascontiguousarray(arrays["positions"], dtype=np.float32),
+            np.ascontiguousarray(arrays["root"], dtype=np.float32),
+            arrays["offsets"].astype(np.int64),
+            **texts | {"label": tuple(map(cleaned, texts["label"]))},
+        )
+
+
+_TEXTS = ("trial_id", "label", "kind", "subject")
+_KEYS = ("positions", "root", "offsets", *_TEXTS)
+
+
+def _check(path: Path, arrays: Mapping[str, Any]) -> None:
+    for key in _KEYS:
+        require(key in arrays, f"{path}: key {key!r}", "it in a file of recordings", f"none; {WHERE}")
+    trials = len(arrays["trial_id"])
+    frames = len(arrays["positions"])
+    shapes = {"positions": (frames, len(JOINTS), 3), "root": (frames, 4), "offsets": (trials + 1,)}
+    for key, expected in (shapes | dict.fromkeys(_TEXTS, (trials,))).items():
+        require(arrays[key].shape == expected, f"{path}: key {key!r}", f"shape {expected}", arrays[key].shape)
+    offsets = arrays["offsets"]
+    growing = trials and offsets[0] == 0 and offsets[-1] == frames and (np.diff(offsets) >= 1).all()
+    require(growing, f"{path}: key 'offsets'", f"ends of one trial or more, growing from 0 to {frames}", "others")
+    for key in ("positions", "root"):
+        finite = arrays[key].dtype.kind == "f" and np.isfinite(arrays[key]).all()
+        require(finite, f"{path}: key {key!r}", "finite numbers", "others")
+
+
+@cache
+def read_folder(root: Path | None) -> tuple[Recordings, tuple[Segment, ...]]:
+    """Recordings of a folder, and the segments of single actions: the folder's ``segments.csv``, else the shipped segments.
+
+    Raises:
+        UserError: for a missing folder, missing recordings, or damaged recordings.
+    """
+    if root is None:
+        raise UserError(f"data.root: expected a folder of recordings, found none; {WHERE}")
+    present = f"{'a file' if root.exists() else 'nothing'} at {short(str(root))}; {WHERE}"
+    require(root.is_dir(), "data.root", "a folder of recordings", present)
+    path = next((root / name for name in FILES if (root / name).is_file()), None)
+    if path is None:
+        raise UserError(f"{root}: expected {FILE}, found {'other files' if any(root.iterdir()) else 'an empty folder'}; {WHERE}")
+    segments = root / SEGMENTS
+    return Recordings.load(path), read_segments(segments if segments.is_file() else SHIPPED)
+
+
 MAX_SPEED = 12.0
 """Maximum joint speed in metres per second. Faster frames are glitches, or hips without defined yaw; trials are cut there."""
 LONGEST = 128
@@ -57,15 +190,8 @@ def moving(motions: Sequence[Tensor], concepts: Sequence[str], provenance: Mappi
     )
 
 
-@dataclass(frozen=True)
-class Piece:
-    """Part of a trial without glitches, at least as long as a window.
-
-    Attributes:
-        trial: number of the trial.
-        concept: concept of the motion.
-        states: ``(frame, 42)`` float32.
-    """
+class Piece(NamedTuple):
+    """Part of a trial, given by number, without glitches; its states ``(frame, 42)`` are at least as long as a window."""
 
     trial: int
     concept: str
@@ -78,29 +204,19 @@ class Piece:
 
 @dataclass(frozen=True)
 class Recorded:
-    """Recordings of a folder, read lazily.
-
-    Attributes:
-        root: the folder; ``None`` for rule-based initial poses only.
-    """
+    """Recordings of a folder, read lazily; without a folder, a source of rule-based initial poses only."""
 
     root: Path | None
 
     @property
     def recordings(self) -> Recordings:
         """All trials of the folder."""
-        return self._folder[0]
+        return read_folder(self.root)[0]
 
     @property
     def segments(self) -> tuple[Segment, ...]:
         """Segments of single actions."""
-        return self._folder[1]
-
-    @property
-    def _folder(self) -> tuple[Recordings, tuple[Segment, ...]]:
-        if self.root is None:
-            raise UserError(f"data.root: expected a folder of recordings, found none; {WHERE}")
-        return read_folder(self.root)
+        return read_folder(self.root)[1]
 
     def split(self, name: Split, count: int, seed: int) -> Demonstrations:
         """All pieces of trials of the training concepts, and in ``'train'`` their mirror images.
@@ -113,10 +229,8 @@ class Recorded:
             UserError: if the folder has no trial for the split.
         """
         wanted = [piece for piece in self._pieces if (piece.trial in self._validation) == (name == "validation")]
-        if not wanted:
-            raise UserError(
-                f"{self.root}: expected trials of the training concepts for {name}, found none; use more of the database"
-            )
+        expected = f"trials of the training concepts for {name}"
+        require(wanted, str(self.root), expected, "none; use more of the database")
         if name == "train":
             reflected = [Piece(piece.trial, mirrored_text(piece.concept), mirrored(piece.states)) for piece in wanted]
             wanted += [piece for piece in reflected if piece.concept in TRAINING_CONCEPTS]
@@ -125,21 +239,19 @@ class Recorded:
     def draw(self, task: str, count: int, seed: int, workers: int = 1) -> Demonstrations:
         """Demonstrations of a concept, without replacement if there are enough.
 
-        For a new concept, windows as long as a plan, each from the pose nearest to standing at rest (:func:`at_rest`), which aligns
-        variation over a plan in time. If there are too few, windows from random frames follow. For a training concept, pieces of
-        its trials.
+        For a new concept, windows as long as a plan, each from a pose nearest to standing at rest, which aligns them in time. If
+        there are too few, windows from random frames follow. For a training concept, pieces of its trials.
 
         Raises:
             UserError: if no trial of the folder shows the concept.
         """
         new = task in NEW_CONCEPTS
         shown = self._shown(task) if new else [piece for piece in self._pieces if piece.concept == task]
-        if not shown:
-            raise UserError(f"task: expected a concept that trials in {self.root} show, found {task!r}, which none does")
+        require(shown, "task", f"a concept that trials in {self.root} show", repr(task))
         draw = generator("cpu", seed, task_key(task))
-        every = [piece.window(start) for piece in shown for start in at_rest(piece.states)] if new else shown
-        order = torch.randperm(len(every), generator=draw).tolist()
-        windows = [every[row] for row in order[:count]]
+        choices = [piece.window(start) for piece in shown for start in at_rest(piece.states)] if new else shown
+        order = torch.randperm(len(choices), generator=draw).tolist()
+        windows = [choices[row] for row in order[:count]]
         while len(windows) < count:
             piece = shown[int(torch.randint(len(shown), (1,), generator=draw))]
             windows.append(piece.window(int(torch.randint(len(piece.states) - HORIZON + 1, (1,), generator=draw))))
@@ -149,8 +261,7 @@ class Recorded:
         """Initial poses, with equal probability of trials.
 
         For a training concept, poses of its trials, held out if possible. Otherwise poses of people who stand or walk with arms
-        down, in validation trials without demonstrators of new concepts. Without a folder, rule-based poses, see
-        :mod:`ftl_lightning.domains.mocap.standing`.
+        down, in validation trials without demonstrators of new concepts. Without a folder, rule-based poses.
 
         Raises:
             UserError: if the folder has neither.
@@ -172,18 +283,14 @@ class Recorded:
             UserError: if there is none.
         """
         subjects = self.recordings.subject
-        trials = {trial: self.recordings.trial(trial) for trial in sorted(self._validation)}
-        poses = [torch.from_numpy(trials[trial]) for trial in trials if subjects[trial] not in DEMONSTRATORS]
+        trials = [trial for trial in sorted(self._validation) if subjects[trial] not in DEMONSTRATORS]
+        poses = [torch.from_numpy(self.recordings.trial(trial)) for trial in trials]
         hanging = tuple(down for states in poses if len(down := states[hang_down(states)]))
-        if not hanging:
-            raise UserError(f"{self.root}: expected held-out trials in which someone stands with arms down, found none")
+        require(hanging, str(self.root), "held-out trials in which someone stands with arms down", "none")
         return hanging
 
     def training_poses(self) -> tuple[Tensor, ...]:
-        """Poses with arms down ``(pose, 42)`` of each training trial that has any.
-
-        Mirror images are included.
-        """
+        """Poses with arms down ``(pose, 42)``, and their mirror images, of each training trial that has any."""
         trials = sorted({piece.trial for piece in self._pieces} - self._validation)
         down = [poses[hang_down(poses)] for poses in (torch.from_numpy(self.recordings.trial(trial)) for trial in trials)]
         return tuple(torch.cat((poses, mirrored(poses))) for poses in down if len(poses))
@@ -196,25 +303,21 @@ class Recorded:
 
     @cached_property
     def _pieces(self) -> list[Piece]:
-        """Pieces of training concepts, in the order of the trials."""
-        return _training_pieces(self.recordings)
+        return training_pieces(self.recordings)
 
     @cached_property
     def _validation(self) -> frozenset[int]:
-        """Validation trials."""
-        return _validation_trials(self._pieces)
+        return validation_trials(self._pieces)
 
     def _shown(self, task: str) -> list[Piece]:
         """Pieces of a new concept by its demonstrators."""
-        every = self.recordings
-        shown = []
+        recordings, shown = self.recordings, []
         for segment in self.segments:
-            if segment.label != task or segment.trial_id not in every.trial_id:
-                continue
-            trial = every.trial_id.index(segment.trial_id)
-            if every.subject[trial] in DEMONSTRATORS:
-                parts = pieces(every.trial(trial)[segment.start : segment.stop], longest=None)
-                shown += [Piece(trial, task, states) for states in parts]
+            if segment.label == task and segment.trial_id in recordings.trial_id:
+                trial = recordings.trial_id.index(segment.trial_id)
+                if recordings.subject[trial] in DEMONSTRATORS:
+                    parts = pieces(recordings.trial(trial)[segment.start : segment.stop], longest=None)
+                    shown += [Piece(trial, task, states) for states in parts]
         return shown
 
     def _demonstrations(self, chosen: Sequence[Piece], provenance: dict[str, object]) -> Demonstrations:
@@ -223,49 +326,29 @@ class Recorded:
         return moving([piece.states for piece in chosen], [piece.concept for piece in chosen], record)
 
 
-def _no_training(every: Recordings, trial: int) -> str:
+def unused_reason(recordings: Recordings, trial: int) -> str:
     """Reason why a trial is in neither training nor validation; empty if it is in either."""
-    if every.trial_id[trial] in HELD_OUT:
+    if recordings.trial_id[trial] in HELD_OUT:
         return "held out whole, as it shows a new concept"
-    if every.label[trial] not in TRAINING_CONCEPTS:
+    if recordings.label[trial] not in TRAINING_CONCEPTS:
         return "description that is no training concept"
-    if every.kind[trial] in OTHER_FIGURES:
-        return f"another figure than the subject's own ({every.kind[trial]})"
+    if recordings.kind[trial] in OTHER_FIGURES:
+        return f"another figure than the subject's own ({recordings.kind[trial]})"
     return ""
 
 
-def _training_pieces(every: Recordings) -> list[Piece]:
+def training_pieces(recordings: Recordings) -> list[Piece]:
     """Pieces of training and validation trials, in the order of the trials."""
-    wanted = [trial for trial in range(len(every)) if not _no_training(every, trial)]
-    return [Piece(trial, every.label[trial], states) for trial in wanted for states in pieces(every.trial(trial))]
+    wanted = [trial for trial in range(len(recordings)) if not unused_reason(recordings, trial)]
+    return [Piece(trial, recordings.label[trial], states) for trial in wanted for states in pieces(recordings.trial(trial))]
 
 
-def _validation_trials(training: Sequence[Piece]) -> frozenset[int]:
+def validation_trials(training: Sequence[Piece]) -> frozenset[int]:
     """The last, eleventh last ... trial of each concept with three or more trials."""
-    trials: dict[str, list[int]] = {}
+    trials: dict[str, dict[int, None]] = {}
     for piece in training:
-        if piece.trial not in (known := trials.setdefault(piece.concept, [])):
-            known.append(piece.trial)
-    return frozenset(trial for known in trials.values() if len(known) > 2 for trial in known[::-10])
-
-
-def left_out(every: Recordings) -> dict[int, str]:
-    """Trials without use in pretraining, by number, and reasons."""
-    training = _training_pieces(every)
-    validation, used = _validation_trials(training), {piece.trial for piece in training}
-    reasons = {}
-    for trial in range(len(every)):
-        short = "" if trial in used else f"no piece of {HORIZON} frames without glitches"
-        held_out = "held out for validation" if trial in validation else ""
-        if reason := _no_training(every, trial) or short or held_out:
-            reasons[trial] = reason
-    return reasons
-
-
-def too_short(states: NDArray[np.float32]) -> int:
-    """Number of frames of a trial ``(frame, 42)`` in pieces shorter than a window."""
-    ends = pairwise((0, *glitches(states), len(states)))
-    return sum(stop - start for start, stop in ends if stop - start < HORIZON)
+        trials.setdefault(piece.concept, {})[piece.trial] = None
+    return frozenset(trial for shown in trials.values() if len(shown) > 2 for trial in list(shown)[::-10])
 
 
 def pieces(states: NDArray[np.float32], longest: int | None = LONGEST) -> list[Tensor]:
@@ -298,9 +381,7 @@ def at_rest(states: Tensor) -> list[int]:
 
 def hang_down(poses: Tensor) -> Tensor:
     """Whether poses ``(pose, 42)`` are upright with both arms hanging down: ``(pose,)``."""
-    joints = as_joints(poses)
-    wrists, hips = joints[:, list(skeleton.WRISTS)], joints[:, list(skeleton.HIPS)]
-    shoulders, ankles = joints[:, list(skeleton.SHOULDERS)], joints[:, list(skeleton.ANKLES)]
+    wrists, hips, shoulders, ankles = (as_joints(poses)[:, list(pair)] for pair in (WRISTS, HIPS, SHOULDERS, ANKLES))
     low = (wrists[..., 2] < shoulders[..., 2] - 0.2).all(dim=1)
     near = (torch.linalg.vector_norm(wrists - hips, dim=-1) < ARMS_DOWN).all(dim=1)
     upright = (shoulders[..., 2] > UPRIGHT).all(dim=1) & (ankles[..., 2].mean(dim=1) < -2 * UPRIGHT)

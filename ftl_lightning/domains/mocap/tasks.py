@@ -1,104 +1,29 @@
-"""Descriptions: training concepts, new concepts learned from few demonstrations, and held-out trials.
+"""Descriptions of motion: training concepts, new concepts learned from few demonstrations, their actions, and segments of trials.
 
 Training concepts are descriptions of trials by the database (``cmu-mocap-index.csv``, compiled by B. Hahne from mocap.cs.cmu.edu),
 as :func:`cleaned`. Pretraining excludes trials of other concepts.
 """
 
+import csv
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
 
 from ftl_lightning.domains.tasks import EvaluationTask, Suite
+from ftl_lightning.services.errors import UserError, require
+from ftl_lightning.services.limits import read_text
 
 HELD_OUT = ("13_29", "13_30", "13_31", "14_14", "14_20", "79_01", "80_71", "126_03", "126_04", "126_05")
 """Trials excluded from pretraining as a whole, since they show a new concept."""
 DEMONSTRATORS = ("13", "79", "80", "126")
 """Subjects who demonstrate new concepts, excluded from the training of the judge."""
-ACTION_OF: Mapping[str, str | None] = {
-    "acrobatics - spin/twirl, hang on ropes": None,
-    "backflip": None,
-    "balance on one leg, outstretched arms": "pose",
-    "basketball - backward dribble": "basketball",
-    "basketball - crossover dribble, shoot": "basketball",
-    "basketball - dribble, shoot": "basketball",
-    "basketball - forward dribble": "basketball",
-    "basketball - forward dribble, 90-degree left turns": "basketball",
-    "basketball - forward dribble, 90-degree right turns": "basketball",
-    "basketball - forward dribble, 90-degree right turns, crossover dribble": "basketball",
-    "basketball - low, fast free style dribble, dribble through legs": "basketball",
-    "basketball - sideways dribble": "basketball",
-    "basketball signals": "signals",
-    "bend over, scoop up, rise, lift arm": None,
-    "brisk walk": "walk",
-    "cartwheel": "cartwheel",
-    "cartwheels": "cartwheel",
-    "charleston side by side female": "charleston",
-    "charleston side by side male": "charleston",
-    "dance - arms held high, pointe tendue a terre, upper body rotation": "ballet",
-    "dance - arms held high, side arabesque": "pose",
-    "dance - attitude/arabesque, jete en tourant, bending back": "ballet",
-    "dance - cartwheel-like start, pirouettes, jete": "cartwheel",
-    "dance - coupe dessous, grand jete en tourant": "ballet",
-    "dance - coupe dessous, jete en tourant": "ballet",
-    "dance - expressive arms, pirouette": "ballet",
-    "dance - fold in from side arabesque, curl inwards": "pose",
-    "dance - glissade devant, glissade derriere, attitude/arabesque": "ballet",
-    "dance - lean back on bent leg, balance, bend elbow by ear": "pose",
-    "dance - lean forward, bring back leg forward, arching arms": "pose",
-    "dance - quasi-cou-de-pied, raised leg above hip-height, jete en tourant": "ballet",
-    "dance - retire derriere, attitude/arabesque": "ballet",
-    "dance - rond de jambe in the air, jete, turn": "ballet",
-    "dance - sideways arabesque, folding arms, bending back": "ballet",
-    "dance - sideways arabesque, turn step, folding arms": "ballet",
-    "dance - sideways steps, pirouette": "ballet",
-    "dance - small jetes, attitude/arabesque, shifted-axis pirouette, turn": "ballet",
-    "dance - small jetes, pirouette": "ballet",
-    "direct traffic, wave, point": "signals",
-    "forward jump": "jump",
-    "heian shodan": None,
-    "jump": "jump",
-    "jump up and down, hop on one foot": "jump",
-    "jump, balance": "jump",
-    "jumps kicks and punches": None,
-    "lambada dance": "lambada",
-    "navigate - walk forward, backward, sideways": "walk",
-    "playground - climb": "climb",
-    "playground - climb, go under": "climb",
-    "playground - climb, go under, jump down": "climb",
-    "playground - climb, hang, hold self up with arms straight, swing, drop, sit, dangle legs, go under": "climb",
-    "playground - climb, hang, lean over, jump down": "climb",
-    "playground - climb, hang, swing": "climb",
-    "playground - climb, jump down, dangle, legs push off against": "climb",
-    "playground - climb, pull up, dangle, sit, lower self to ground": "climb",
-    "playground - climb, sit, dangle legs, descend": "climb",
-    "playground - climb, sit, dangle legs, jump down": "climb",
-    "playground - climb, sit, dangle legs, rock back, lower self to ground": "climb",
-    "playground - climb, swing, lean back, drop": "climb",
-    "playground - forward jumps, turn around": "jump",
-    "punch/strike": "punch",
-    "run": "run",
-    "run, leap": None,
-    "run/jog": "run",
-    "slow walk": "walk",
-    "slow walk/stride": "walk",
-    "soccer - kick ball": "kick",
-    "start hop stop": "jump",
-    "static dance pose - folded in, head lowered, leg bent": "pose",
-    "swordplay": "swordplay",
-    "walk": "walk",
-    "walk on uneven terrain": "walk",
-    "walk, 90-degree left turn": "walk",
-    "walk, 90-degree right turn": "walk",
-    "walk, exaggerated stride": "walk",
-    "walk, veer left": "walk",
-    "walk, veer right": "walk",
-    "walk/stride": "walk",
-    "walking, sitting, looking, stand up": None,
-    "wash self": None,
-    "wash windows": None,
-    "zombie walk": "walk",
-}
-"""Training concepts and their actions (:mod:`ftl_lightning.domains.mocap.actions`); ``None`` for other actions, or several in
-sequence. Dances are separate actions: each kind was danced by a single subject."""
+with (Path(__file__).parent / "actions.csv").open(encoding="utf-8", newline="") as _file:
+    ACTION_OF: Mapping[str, str | None] = {row["description"]: row["action"] or None for row in csv.DictReader(_file)}
+"""Training concepts and their actions; ``None`` for other actions, or several in sequence.
+
+Dances are separate actions: each kind was danced by a single subject.
+"""
 TRAINING_CONCEPTS = tuple(ACTION_OF)
 PAPER_CONCEPTS = ("jumping jacks",)
 """New concepts of the paper in most copies of the database."""
@@ -125,11 +50,6 @@ def cleaned(description: str) -> str:
 def mirrored_text(text: str) -> str:
     """Description of the mirror image: left and right exchanged."""
     return re.sub(r"\b(left|right)\b", lambda side: _SIDES[side[0]], text)
-
-
-def goal_parts(goal: str) -> tuple[str, ...]:
-    """Concepts of a goal, mostly a single concept."""
-    return tuple(goal.split(AND))
 
 
 def _new(concepts: tuple[str, ...]) -> tuple[EvaluationTask, ...]:
@@ -184,3 +104,109 @@ SUITES = {
 
 ``'database'`` needs the trials of :data:`DATABASE_CONCEPTS` in the user's copy. ``'whole'`` is the part of ``'composition'`` for
 methods that cannot compose by parts of the body."""
+
+
+OTHER = "other"
+"""No action: motions of a single person, standing people, and windows without motion (a frozen frame, trembling)."""
+
+_NAMES = (
+    "walk", "run", "jump", "kick", "punch", "signals", "jumping jacks", "twist", "knee raise", "arm circle", "squat", "toe touch",
+    "ballet", "basketball", "cartwheel", "charleston", "climb", "lambada", "pose", "swordplay",
+)  # fmt: skip
+CLASSES = (*_NAMES, OTHER)
+"""Classes of a judge."""
+
+TESTED = CLASSES[: CLASSES.index("toe touch") + 1]
+"""Classes of two subjects or more, on which a judge can be tested with new people."""
+
+_LABELS = {"jog": "run", "leg kick": "kick", "toe touch one hand": "toe touch", "toe touch two hands": "toe touch"}
+"""Labels of segments that are no training concepts."""
+_CLASS_OF = {name: name for name in _NAMES} | _LABELS | {text: name for text, name in ACTION_OF.items() if name is not None}
+
+STAND = "stand"
+"""Class of the legs in actions of arms and trunk."""
+STANDING = ("punch", "signals", "twist", "arm circle", "toe touch", "swordplay")
+"""Actions of arms and trunk."""
+STEPPING = ("walk", "run", "kick", "knee raise", "squat", "basketball")
+"""Actions of the legs, independent of the arms."""
+REVERSIBLE = ("jumping jacks", "twist", "knee raise", "arm circle", "squat", "toe touch")
+"""Periodic actions, invariant to time reversal."""
+LEG_CLASSES = (*(name for name in CLASSES if name not in STANDING), STAND)
+"""Classes of a judge of the legs."""
+
+
+def action(text: str) -> str | None:
+    """Class of a description; ``None`` for no class, or several in sequence."""
+    return _CLASS_OF.get(cleaned(text))
+
+
+def actions(goal: str) -> tuple[str, ...]:
+    """Classes of a goal: for two joined actions, arms and trunk first, then the legs; empty if the goal cannot be judged."""
+    classes = [action(part) for part in goal.split(AND)]
+    return tuple(name for name in classes if name is not None) if None not in classes and len(classes) <= 2 else ()
+
+
+def judged(goal: str) -> bool:
+    """Whether a goal can be judged."""
+    return bool(actions(goal))
+
+
+def of_legs(name: str) -> str:
+    """Class of the legs in an action."""
+    return STAND if name in STANDING else name
+
+
+SEGMENTS = "segments.csv"
+SHIPPED = Path(__file__).parent / SEGMENTS
+HEADER = ("trial_id", "label", "start30", "stop30")
+
+
+@dataclass(frozen=True)
+class Segment:
+    """Part of a trial with a single action, annotated by hand.
+
+    Shipped segments are from M. C. Hughes (mocap6dataset, ``truelabels``: a label per tenth of a second; subjects 13 and 14) and
+    F. Zhou (aca, ``moc``: the middle value; subject 86). ``segments.csv`` in a folder of recordings replaces them.
+
+    Attributes:
+        trial_id: such as ``13_29``.
+        label: the action.
+        start, stop: frames at 30 per second, the last excluded; ``stop`` is ``None`` for the end of the trial.
+    """
+
+    trial_id: str
+    label: str
+    start: int
+    stop: int | None
+
+
+WHOLE_TRIALS = tuple(
+    Segment(trial, label, 0, None)
+    for label, trials in (("chop wood", ("79_01", "80_71")), ("breaststroke", ("126_03", "126_04", "126_05")))
+    for trial in trials
+)
+"""Trials that show a new action from start to end."""
+
+
+def read_segments(path: Path) -> tuple[Segment, ...]:
+    """Segments of a file with the columns ``trial_id,label,start30,stop30``, and :data:`WHOLE_TRIALS`.
+
+    Raises:
+        UserError: with path and line.
+    """
+    try:
+        lines = list(csv.reader(read_text(path, "table of segments").splitlines()))
+    except csv.Error as error:
+        raise UserError(f"{path}: expected a table of segments (CSV), found a file that cannot be read ({error})") from error
+    header = lines[0] if lines else []
+    require(tuple(header) == HEADER, f"{path}: line 1", ",".join(HEADER), ",".join(header) or "nothing")
+    segments = []
+    for number, fields in enumerate(lines[1:], start=2):
+        numbers = [int(field) for field in fields[2:] if field.strip().isdigit()]
+        valid = len(fields) == len(HEADER) and len(numbers) == 2 and numbers[0] < numbers[1]
+        expected = "a trial, a label, a first frame and a later frame"
+        require(valid or not fields, f"{path}: line {number}", expected, repr(",".join(fields)))
+        if fields:
+            segments.append(Segment(fields[0].strip(), fields[1].strip(), *numbers))
+    labels = {segment.label for segment in segments}
+    return (*segments, *(segment for segment in WHOLE_TRIALS if segment.label not in labels))

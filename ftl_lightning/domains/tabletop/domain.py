@@ -1,45 +1,64 @@
-"""Domain object of the table-top."""
+"""Domain objects of the table-top, and reference policies."""
 
+import logging
+from collections.abc import Callable, Collection
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+import torch
 from torch import Tensor
 
-from ftl_lightning.data.features import Observed
+from ftl_lightning.data.demonstrations import Demonstrations
+from ftl_lightning.data.features import InitialStates, Observed
 from ftl_lightning.domains.comparison import Comparison, Paper, Published
 from ftl_lightning.domains.domain import EXECUTED, Concepts, Domain, Plans, Privileged, deferred
-from ftl_lightning.domains.execution import ClosedLoop
+from ftl_lightning.domains.execution import ClosedLoop, Policy, Rollout
 from ftl_lightning.domains.pictures import Show
+from ftl_lightning.domains.tabletop.experts import PUSH_HEIGHT
 from ftl_lightning.domains.tabletop.interface import (
+    ACTION,
     FEATURES,
     MAX_STEPS,
     NAME,
     PLACES,
     POSE,
+    PUSH,
+    PUSH_ON_BOOK,
     SEEN,
     STATE_NAMES,
     STATE_UNITS,
+    SUITES,
+    TASKS,
+    TRAINING_CONCEPTS,
+    VIEWS,
+    WIDE_CONCEPTS,
     WIDE_NAME,
+    WIDE_SUITES,
     check_simulator,
+    check_task,
+    misplaced,
+    told,
 )
-from ftl_lightning.domains.tabletop.policies import POLICIES
-from ftl_lightning.domains.tabletop.scenes import OBJECTS
-from ftl_lightning.domains.tabletop.success import judge
-from ftl_lightning.domains.tabletop.tasks import PUSH, SUITES, TRAINING_CONCEPTS, WIDE_CONCEPTS, WIDE_SUITES
-from ftl_lightning.domains.tabletop.views import VIEWS, misplaced, told
+from ftl_lightning.domains.tabletop.scenes import OBJECTS, TRIANGLE
+from ftl_lightning.services.errors import UserError
 
 if TYPE_CHECKING:
     from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
     from ftl_lightning.domains.tabletop.source import Expert
 
+_LOG = logging.getLogger(__name__)
+BOOK_MOVED = 0.02
+"""Displacement in metres above which the book counts as moved."""
 HORIZON = 32
 """States per plan, as in the paper."""
 RENDERING = "ftl_lightning.domains.tabletop.rendering"
 
 
-def source(root: Path | None) -> "Expert":
-    """Scripted experts.
+def source(root: Path | None, wide: bool = False) -> "Expert":
+    """Scripted experts; those of the wide domain have recoveries for all concepts.
 
     Raises:
         UserError: without the simulator.
@@ -47,23 +66,11 @@ def source(root: Path | None) -> "Expert":
     check_simulator()
     from ftl_lightning.domains.tabletop.source import Expert
 
-    return Expert()
+    return Expert(WIDE_CONCEPTS, WIDE_NAME, begun_anew=WIDE_CONCEPTS) if wide else Expert()
 
 
-def wide_source(root: Path | None) -> "Expert":
-    """Scripted experts of the wide domain, with recoveries for all concepts.
-
-    Raises:
-        UserError: without the simulator.
-    """
-    check_simulator()
-    from ftl_lightning.domains.tabletop.source import Expert
-
-    return Expert(WIDE_CONCEPTS, WIDE_NAME, begun_anew=WIDE_CONCEPTS)
-
-
-def environment() -> "TableTopEnvironment":
-    """Environment of the domain.
+def environment(ends_at: Collection[str] = (TRIANGLE,)) -> "TableTopEnvironment":
+    """Environment in which an episode ends when the circle touches any of the objects ``ends_at``.
 
     Raises:
         UserError: without the simulator, or if it does not start.
@@ -71,31 +78,73 @@ def environment() -> "TableTopEnvironment":
     check_simulator()
     from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
 
-    return TableTopEnvironment()
+    return TableTopEnvironment(ends_at=ends_at)
 
 
-def wide_environment() -> "TableTopEnvironment":
-    """Environment in which an episode ends when the circle touches any object.
+def judge(goal: str, rollout: Rollout) -> dict[str, Tensor]:
+    """Judge episodes.
 
-    Raises:
-        UserError: as :func:`environment`.
+    Returns:
+        ``(episode,)`` each: ``success``; ``book moved``, by more than :data:`BOOK_MOVED`.
     """
-    check_simulator()
-    from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
+    from ftl_lightning.domains.tabletop.environment import judged
 
-    return TableTopEnvironment(ends_at=OBJECTS)
+    scenes = rollout.starts.require_scenes().numpy()
+    success = [judged(goal, scene, info) for scene, info in zip(scenes, rollout.infos, strict=True)]
+    moved = [info.get("book", 0.0) > BOOK_MOVED for info in rollout.infos]
+    return {"success": torch.tensor(success) & ~rollout.failed, "book moved": torch.tensor(moved)}
 
 
 def act(plans: Tensor, step: int, observed: Observed) -> Tensor:
-    """Next command ``(episode, 4)``: the next state of the plan, whose first state is the last command.
-
-    Args:
-        plans: ``(episode, horizon, 4)``.
-        step: steps since the plan was made.
-        observed: ignored: the environment moves the hand from the last command.
-    """
+    """Next command ``(episode, 4)``: the next state of plans ``(episode, horizon, 4)``, whose first state is the last command."""
     return plans[:, min(step + 1, plans.shape[1] - 1)]
 
+
+Make = Callable[[str, InitialStates, Demonstrations | None, int], Policy | None]
+
+
+def _replayed(tasks: tuple[str, ...], height: float | None = None, feedback: bool = True) -> Make:
+    """Policy that replays actions of an expert, recorded in a separate simulation; bitwise equal to running the expert.
+
+    Args:
+        tasks: tasks with this reference.
+        height, feedback: see :func:`ftl_lightning.domains.tabletop.experts.moves`.
+    """
+
+    def make(goal: str, starts: InitialStates, demonstrations: Demonstrations | None, seed: int) -> Policy | None:
+        if check_task(goal) not in tasks:
+            return None
+        check_simulator()
+        from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
+        from ftl_lightning.domains.tabletop.source import perform
+
+        actions: list[Tensor] = []
+        env = TableTopEnvironment()
+        try:
+            for row, scene in enumerate(starts.require_scenes().numpy()):
+                try:
+                    done = perform(env, goal, scene, np.random.default_rng([seed, row]), height, feedback)
+                    actions.append(torch.from_numpy(done.actions))
+                except (UserError, MemoryError, OSError):
+                    raise
+                except Exception as error:  # any error of the simulator: other episodes continue
+                    _LOG.warning("table-top %r, episode %d: %r; the reference policy has no action there", goal, row, error)
+                    actions.append(torch.full((1, ACTION), torch.nan))
+                    env.close()
+                    env = TableTopEnvironment()
+        finally:
+            env.close()
+        return lambda observed, rows, step: torch.stack([actions[row][min(step, len(actions[row]) - 1)] for row in rows])
+
+    return make
+
+
+POLICIES = {
+    "expert (oracle)": _replayed(TASKS),
+    "table-height push": _replayed((PUSH_ON_BOOK,), height=PUSH_HEIGHT),
+    "straight push": _replayed((PUSH, PUSH_ON_BOOK), feedback=False),
+}
+"""``table-height push`` pushes on the book at table height; ``straight push`` has no feedback."""
 
 _ON_ROBOT = ("new concept", 0.55, ""), ("training representation", 0.15, ""), ("training concept", 0.90, PUSH)
 PUBLISHED = tuple(Published(setting, value, task=task, metric=EXECUTED) for setting, value, task in _ON_ROBOT)
@@ -137,8 +186,8 @@ WIDE = replace(
     DOMAIN,
     name=WIDE_NAME,
     concepts=Concepts(training=WIDE_CONCEPTS, suites=WIDE_SUITES, table=Path(__file__).parent / "wide_embeddings.safetensors"),
-    source=wide_source,
-    closed_loop=replace(_LOOP, environment=wide_environment),
+    source=partial(source, wide=True),
+    closed_loop=replace(_LOOP, environment=partial(environment, ends_at=OBJECTS)),
     comparison=replace(DOMAIN.comparison, paper=None),
 )
 """Table-top with more pushes and picks than the paper."""

@@ -1,6 +1,6 @@
 """Gymnasium environment of a Panda arm at a table, simulated by pybullet."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import gymnasium
@@ -8,23 +8,44 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ftl_lightning.domains.execution import Simulator, pybullet
-from ftl_lightning.domains.tabletop.interface import ACTION, FEATURES, HERTZ, IMAGE, MAX_STEPS, OPEN, POSE, THRESHOLD
+from ftl_lightning.domains.tabletop.interface import (
+    ACTION,
+    BESIDE,
+    FEATURES,
+    FRONT,
+    HERTZ,
+    IMAGE,
+    MAX_STEPS,
+    OPEN,
+    OVERHEAD,
+    POSE,
+    PUSH,
+    PUSH_ON_BOOK,
+    PUSHES,
+    THRESHOLD,
+    TO_BOOK,
+    check_task,
+)
 from ftl_lightning.domains.tabletop.scenes import (
     BOOK,
     CIRCLE,
+    COLUMNS,
     HAND,
     HEIGHT,
     OBJECTS,
     SCENE,
+    TARGET,
     TRIANGLE,
+    WHITE,
     check,
     draw_scene,
     gap,
     outline,
+    support,
+    within,
 )
-from ftl_lightning.domains.tabletop.tasks import PUSH, check_task
-from ftl_lightning.domains.tabletop.world import ARM, FASTEST, FINGERS, FRONT, OVERHEAD, REST, TIP, Bodies, build, downward, turned
-from ftl_lightning.services.errors import UserError
+from ftl_lightning.domains.tabletop.world import ARM, FASTEST, FINGERS, REST, TIP, Bodies, build, downward, turned
+from ftl_lightning.services.errors import UserError, require
 
 TARGETS, SUBSTEPS = 3, 8
 """Arm targets per step, and simulation steps per target."""
@@ -117,15 +138,13 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         self._built += 1
         self.bodies = build(self.client, self.scene, self.arm_drawn)
         self._place(self.scene[HAND][:3].astype(np.float64), OPEN)
-        return self.begun(), self._told()
+        return self.begun(), self._info()
 
     def _place(self, hand: NDArray[np.float64], opening: float) -> None:
         """Set the hand position without simulation."""
         robot = self.bodies.robot
-        for joint, angle in zip(ARM, REST, strict=True):
+        for joint, angle in zip((*ARM, *FINGERS), (*REST, opening / 2, opening / 2), strict=True):
             self.client.resetJointState(robot, joint, angle)
-        for finger in FINGERS:
-            self.client.resetJointState(robot, finger, opening / 2)
         self.command = np.array([*map(float, hand), opening])
         for _ in range(10):  # each search starts from the previous solution
             for joint, angle in zip(ARM, self._angles(self.command[:3]), strict=True):
@@ -140,14 +159,10 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         return list(solution[: len(ARM)])
 
     def step(self, action: NDArray[np.float32]) -> tuple[Seen, float, bool, bool, dict[str, Any]]:
-        """Move for 0.1 s. The reward is 0: success depends on the task, which the environment does not know.
-
-        Raises:
-            UserError: for an action of wrong size, or with numbers that are not finite.
-        """
+        """Move for 0.1 s. The reward is 0: success depends on the task, which the environment does not know."""
         values = np.asarray(action, dtype=np.float64)
-        if values.shape != (ACTION,) or not np.isfinite(values).all():
-            raise UserError(f"table-top action: expected {ACTION} finite numbers, found {values.tolist()}")
+        valid = values.shape == (ACTION,) and np.isfinite(values).all()
+        require(valid, "table-top action", f"{ACTION} finite numbers", values.tolist())
         before = self.command[:3]
         way = np.clip(values[:3], *np.transpose(REACH)) - before
         way *= min(1.0, FASTEST / max(float(np.linalg.norm(way)), 1e-9))
@@ -173,15 +188,10 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         self._touched |= {name for name in places if name != CIRCLE and self._touches(name, places)}
         self._lifted |= bool(places[CIRCLE][2] > self._first[CIRCLE][2] + LIFTED)
         self._trace.append(self._now())
-        seen, info = self._observation(), self._told()
+        info = self._info()
         self._before = places[CIRCLE]
-        return (
-            seen,
-            0.0,
-            bool(self.ends_at & self._touched) or (self._lifted and info["released"]),
-            self._steps >= MAX_STEPS,
-            info,
-        )
+        ended = bool(self.ends_at & self._touched) or (self._lifted and info["released"])
+        return self._observation(), 0.0, ended, self._steps >= MAX_STEPS, info
 
     def places(self) -> dict[str, NDArray[np.float64]]:
         """Centres ``(3,)`` of the objects, by name."""
@@ -234,17 +244,16 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         picture = OVERHEAD.picture(self.client)
         return {IMAGE: np.ascontiguousarray(picture.transpose(2, 0, 1)), POSE: self.hand().astype(np.float32)}
 
-    def _told(self) -> dict[str, Any]:
+    def _info(self) -> dict[str, Any]:
         places, hand = self.places(), self.hand()
         circle = places[CIRCLE]
         released = bool(
             hand[7] > THRESHOLD and hand[2] > circle[2] + AWAY and np.linalg.norm(circle - self._before) < STILL and self._steps
         )
         moved = float(np.linalg.norm(places[BOOK] - self._first[BOOK])) if BOOK in places else 0.0
-        triangle = places.get(TRIANGLE)
         return {
             "circle": circle,
-            "triangle": triangle,
+            "triangle": places.get(TRIANGLE),
             "book": moved,
             "book place": places.get(BOOK),
             "touched": TRIANGLE in self._touched,
@@ -280,3 +289,47 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
 def touching(shape: NDArray[np.float64], circle: NDArray[np.float64]) -> bool:
     """Whether a circle with this centre touches an outline, seen from above."""
     return gap(outline(CIRCLE, float(circle[0]), float(circle[1]), 0.0), shape) <= TOUCH
+
+
+LEVEL = 0.008
+"""Tolerance in metres of the circle's height on a surface."""
+NEAR = 0.15
+"""Maximum centre distance in metres between the circle and the object beside it."""
+
+
+def judged(task: str, scene: NDArray[np.float32], info: Mapping[str, Any]) -> bool:
+    """Whether a task is done.
+
+    - Pushes to the triangle: circle and triangle touch (:data:`TOUCH`); both are still on their initial surface.
+    - Pushes to another object: the circle has touched only this object, and lies on the table.
+    - Picks to the book and to the white surface: the circle was lifted and released; it lies on the surface, its centre over it.
+    - Picks beside an object: the circle was lifted and released; it lies on the table, its centre within :data:`NEAR` of it.
+
+    ``scene (24,)`` is the initial scene, ``info`` that of the last step, empty without a step.
+    """
+    check_task(task)
+    if not info:
+        return False
+    circle = info["circle"]
+    if task in PUSHES and TARGET[task] != TRIANGLE:
+        return set(info["touches"]) == {TARGET[task]} and _lies(circle, 0.0)
+    if task in PUSHES:
+        surface = HEIGHT[BOOK] if task == PUSH_ON_BOOK else support(scene, CIRCLE)
+        both = (circle, info["triangle"])
+        return bool(info["touched"]) and all(place is not None and _lies(place, surface) for place in both)
+    if not (info["lifted"] and info["released"]):
+        return False
+    if task in BESIDE:
+        thing = info["triangle"] if TARGET[task] == TRIANGLE else scene[COLUMNS[TARGET[task]]][1:4]
+        return _lies(circle, 0.0) and float(np.linalg.norm(circle[:2] - thing[:2])) <= NEAR
+    name = BOOK if task == TO_BOOK else WHITE
+    x, y, yaw = map(float, scene[COLUMNS[name]][1:])
+    moved = info["book place"] if task == TO_BOOK else None
+    if moved is not None:
+        x, y = float(moved[0]), float(moved[1])
+    return _lies(circle, HEIGHT[name]) and within(circle[None, :2], outline(name, x, y, yaw))
+
+
+def _lies(place: NDArray[np.float64], surface: float) -> bool:
+    """Whether the centre of circle or triangle has the height of flat contact with a surface."""
+    return abs(float(place[2]) - surface - HEIGHT[CIRCLE] / 2) <= LEVEL

@@ -1,16 +1,26 @@
-"""Scripted experts: policies that command the next hand position from the object positions."""
+"""Scripted experts: policies that command the next hand position from the object positions.
+
+A push is a function of the current positions alone. A low hand behind the circle pushes. Any other hand rises, travels above the
+table, and descends behind the circle. The same rule thus starts a push and restarts it when the circle has slipped away.
+"""
 
 import math
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ftl_lightning.domains.tabletop.distractors import scattered
-from ftl_lightning.domains.tabletop.interface import IMAGE, MAX_STEPS, OPEN, POSE
-from ftl_lightning.domains.tabletop.pushing import CLEAR, Manner, Place, around, pushed
+from ftl_lightning.domains.tabletop.interface import (
+    AROUND_BOWL,
+    MAX_STEPS,
+    OPEN,
+    PUSH_ON_BOOK,
+    PUSHES,
+    TO_BOOK,
+    TO_WHITE,
+)
 from ftl_lightning.domains.tabletop.scenes import (
     APART,
     BOOK,
@@ -18,6 +28,7 @@ from ftl_lightning.domains.tabletop.scenes import (
     CIRCLE,
     COLUMNS,
     HEIGHT,
+    RING,
     TARGET,
     WHITE,
     gap,
@@ -25,12 +36,117 @@ from ftl_lightning.domains.tabletop.scenes import (
     support,
     within,
 )
-from ftl_lightning.domains.tabletop.success import judged
-from ftl_lightning.domains.tabletop.tasks import AROUND_BOWL, PUSH_ON_BOOK, PUSHES, TO_BOOK, TO_WHITE
 
 if TYPE_CHECKING:
     from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
 
+Place = NDArray[np.float64]
+
+WIDEST = 0.8
+"""Maximum angle in radians of a pushing hand from the line behind the circle, seen from the circle."""
+FARTHEST = 0.12
+"""Maximum distance in metres of a pushing hand from the circle's centre."""
+STEERING = 3.0
+"""Steering gain: deviation of the hand's direction from the circle's, per radian of the hand's angle. 1 moves straight to the
+circle's centre, larger values return to the line behind it."""
+LOW = 0.006
+"""Height in metres above push height below which a hand is low."""
+CLEAR = 0.065
+"""Travel height in metres above push height, above all objects."""
+NEAR, FUNNEL = 0.015, 0.03
+"""Distances in metres from the point of descent: radius in which the hand may be low, and width of the funnel above it. The radius
+exceeds the spread of this point between demonstrations; otherwise their mean would stay in the air."""
+ACROSS, DOWN, UP = 0.016, 0.011, 0.014
+"""Maximum metres per step sideways, down and up."""
+AHEAD = 0.05
+"""Distance in metres of the circle's next goal on the path around the bowl."""
+
+
+@dataclass(frozen=True)
+class Manner:
+    """Style of a push.
+
+    Attributes:
+        height: hand height in metres above the table.
+        speed: metres per step while pushing.
+        haste: factor of the travel speed.
+        behind, aside: start of the push in metres, behind the circle and left of the line to its goal.
+    """
+
+    height: float
+    speed: float
+    haste: float = 1.0
+    behind: float = 0.065
+    aside: float = 0.0
+
+
+def pushed(hand: Place, circle: Place, goal: Place, manner: Manner) -> Place:
+    """Next hand position ``(3,)`` of a push of the circle to a goal.
+
+    For a hand at angle a behind the circle, the hand's direction differs by :data:`STEERING` times a from the circle's; a gain of 2
+    is a dipole field (Igarashi et al., 2010).
+
+    Args:
+        hand: ``(3,)`` in metres.
+        circle, goal: ``(2,)``, the circle's centre and its goal in metres.
+        manner: style of the push.
+    """
+    along, to = complex(*(goal - circle)), complex(*(circle - hand[:2]))
+    distance = abs(to)
+    along /= max(abs(along), 1e-6)
+    angle = math.atan2((to / along).imag, (to / along).real)
+    if hand[2] <= manner.height + LOW and abs(angle) <= WIDEST and distance <= FARTHEST:
+        direction = along * complex(math.cos(STEERING * angle), math.sin(STEERING * angle))
+        step = manner.speed * np.array([direction.real, direction.imag])
+        return np.array([*(hand[:2] + step), manner.height])
+    behind = complex(-manner.behind, manner.aside) * along
+    return _travelled(hand, circle + np.array([behind.real, behind.imag]), manner)
+
+
+def _travelled(hand: Place, begin: Place, manner: Manner) -> Place:
+    """Next position of a hand that descends at ``begin`` ``(2,)``: up first, down only above it."""
+    off = begin - hand[:2]
+    away = float(np.linalg.norm(off))
+    wanted = manner.height + CLEAR * min(1.0, max(0.0, (away - NEAR) / FUNNEL))
+    free = min(1.0, max(0.0, 1 - (wanted - hand[2]) / FUNNEL))  # a low hand rises before it moves
+    step = min(away, free * min(ACROSS * manner.haste, 0.35 * away + 0.0005))
+    rise = float(np.clip(wanted - hand[2], -DOWN * manner.haste, UP * manner.haste))
+    return np.array([*(hand[:2] + step * off / max(away, 1e-9)), hand[2] + rise])
+
+
+def around(circle: Place, goal: Place, bowl: Place) -> Place:
+    """Next goal ``(2,)`` of the circle on the way around the bowl to a goal, :data:`AHEAD` along the path.
+
+    The path leads straight to the ring around the bowl, along its shorter side, and straight on.
+    """
+    line = goal - circle
+    distance = max(float(np.linalg.norm(line)), 1e-6)
+    along = line / distance
+    off = bowl - circle
+    beside, passed = float(along[0] * off[1] - along[1] * off[0]), float(along @ off)
+    if abs(beside) >= RING or not 0 < passed < distance:
+        return goal
+    side = 1.0 if beside > 0 else -1.0  # counter-clockwise is 1
+    first, last = (_tangent(bowl, place, turn) for place, turn in ((circle, -side), (goal, side)))
+    sweep = (side * (last - first)) % (2 * math.pi)
+    angles = first + side * np.linspace(0, sweep, max(2, int(RING * sweep / 0.005)))
+    arc = bowl + RING * np.stack((np.cos(angles), np.sin(angles)), axis=-1)
+    path = np.concatenate((circle[None], arc, goal[None]))
+    travelled = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))))
+    return np.array([np.interp(AHEAD, travelled, column) for column in path.T])
+
+
+def _tangent(centre: Place, place: Place, turn: float) -> float:
+    """Angle on the ring around a centre of the tangent from a point."""
+    off = place - centre
+    distance = max(float(np.linalg.norm(off)), RING + 1e-6)
+    return math.atan2(off[1], off[0]) - turn * math.acos(RING / distance)
+
+
+PAST = 8
+"""Steps that a push continues after success: small position errors must not stop a policy before the triangle."""
+STAY = 4
+"""Steps of rest after a task, so that plans end at rest."""
 CLOSED = 0.0
 PUSH_HEIGHT = 0.014
 """Hand height in metres above the surface under the circle during a push."""
@@ -52,16 +168,15 @@ RETURN = 0.8
 MISLAID = 0.6
 """Recoveries: probability that the circle is moved."""
 LYING, RISING, OVER = 0.5, 0.4, 0.03
-"""Recoveries: probability of a low hand, probability of a hand beside the circle otherwise, and height in metres above push height
-from which the hand may be over the circle."""
+"""Recoveries: probability of a low hand; probability that any other hand is beside the circle; minimum height in metres above push
+height of a hand over the circle."""
 ASTRAY, REACHED = ((0.32, 0.70), (-0.28, 0.28)), ((0.26, 0.77), (-0.35, 0.35))
 """Recoveries: x and y ranges of circle and hand."""
-OPENED = 0.5
-"""Recoveries of picks: probability of an open hand."""
-HIGHEST = 0.16
-"""Recoveries of picks: maximum hand height in metres above push height."""
+OPENED, HIGHEST = 0.5, 0.16
+"""Recoveries of picks: probability of an open hand, and maximum hand height in metres above push height."""
 AROUND, ROOM, FARTHEST_PUSH = (0.034, 0.08), 0.012, 0.33
-"""Recoveries, in metres: range from circle to hand, minimum gap from circle to other objects, maximum distance to the target."""
+"""Recoveries, in metres: range of the distance between hand and circle; minimum gap between the circle and other objects; maximum
+distance between the circle and the target of a push."""
 APART_FROM = 0.12
 """Centre distance in metres between an object and the circle placed beside it; leaves room for open fingers."""
 
@@ -77,7 +192,8 @@ class Style:
         speed: factor of all speeds.
         behind, aside: start of a push in metres, behind the circle and left of the line to its goal.
         hover: travel height in metres.
-        grasp, place: offsets from the circle's centre in metres, and from its goal as a share (-1..1) of the allowed spread.
+        grasp: x and y of the grasp relative to the circle's centre, in metres.
+        place: x and y of the final position relative to the goal, as a fraction (-1..1) of the allowed spread.
     """
 
     speed: float
@@ -110,6 +226,9 @@ class _Expert:
     def circle(self) -> Place:
         return self.env.places()[CIRCLE]
 
+    def goal(self) -> Place:
+        return self.env.places()[TARGET[self.task]][:2]
+
     def go(self, place: Place, speed: float, opening: float) -> Moves:
         """Move straight, with smooth start and end, at most ``speed`` metres per step. Deviations from the line decay."""
         start, goal = self.at[:3].copy(), np.asarray(place, dtype=np.float64)
@@ -129,12 +248,10 @@ class _Expert:
 
 
 def moves(env: "TableTopEnvironment", task: str, how: Style, height: float | None = None, feedback: bool = True) -> Moves:
-    """Generate the commands of a task's expert in the current scene.
+    """Generate the commands of a task's expert in the current scene; the environment is not stepped.
 
     Args:
-        env: environment after reset; it is not stepped.
-        task: known task.
-        how: style of the demonstration.
+        env, task, how: environment after reset, known task, and style of the demonstration.
         height: push height in metres above the table; by default above the surface under the circle.
         feedback: whether pushes observe the circle; otherwise they go straight to the triangle's initial position.
     """
@@ -177,16 +294,6 @@ def _target(expert: _Expert) -> tuple[Place, float]:
     return thing + (APART_FROM + 0.005 * how.place[0]) * along + 0.01 * how.place[1] * np.array([-along[1], along[0]]), 0.0
 
 
-def _behind(expert: _Expert, goal: Place) -> Place:
-    """Return the start of an open-loop push of the circle to a goal."""
-    circle = expert.circle()[:2]
-    return circle - expert.how.behind * (goal - circle) / np.linalg.norm(goal - circle)
-
-
-def _goal(expert: _Expert) -> Place:
-    return expert.env.places()[TARGET[expert.task]][:2]
-
-
 def _push(expert: _Expert, height: float) -> Moves:
     """Push the circle to the task's target, with feedback."""
     how = expert.how
@@ -194,7 +301,7 @@ def _push(expert: _Expert, height: float) -> Moves:
     manner = Manner(height, speed, how.speed, how.behind, how.aside)
     bowl = expert.env.scene[COLUMNS[BOWL]][1:3].astype(np.float64)
     while True:
-        circle, goal = expert.circle()[:2], _goal(expert)
+        circle, goal = expert.circle()[:2], expert.goal()
         if expert.task == AROUND_BOWL:
             goal = around(circle, goal, bowl)
         expert.at = np.array([*pushed(expert.env.command[:3], circle, goal, manner), CLOSED])
@@ -203,8 +310,8 @@ def _push(expert: _Expert, height: float) -> Moves:
 
 def _straight(expert: _Expert, height: float) -> Moves:
     """Push along the initial line from the circle to the task's target."""
-    goal = _goal(expert).copy()
-    begin = _behind(expert, goal)
+    circle, goal = expert.circle()[:2], expert.goal()
+    begin = circle - expert.how.behind * (goal - circle) / np.linalg.norm(goal - circle)
     yield from expert.go(np.array([*begin, height + 0.06]), 0.016, CLOSED)
     yield from expert.go(np.array([*begin, height]), 0.011, CLOSED)
     along = (goal - begin) / np.linalg.norm(goal - begin)
@@ -213,108 +320,11 @@ def _straight(expert: _Expert, height: float) -> Moves:
         yield expert.at
 
 
-@dataclass(frozen=True)
-class Episode:
-    """Episode of an expert.
-
-    Attributes:
-        commands: ``(time, 4)``, executed commands; the first is the initial state.
-        actions: ``(steps, 4)``, actions passed to the environment, which shortens moves that are too far.
-        images: ``(time, 3, 64, 64)`` uint8.
-        poses: ``(time, 8)``, measured.
-        success: whether the task is done.
-        places: ``(time, 5, 4)``, object positions in the images; only with scattered distractors.
-    """
-
-    commands: NDArray[np.float32]
-    actions: NDArray[np.float32]
-    images: NDArray[np.uint8]
-    poses: NDArray[np.float32]
-    success: bool
-    places: NDArray[np.float32] | None = None
-
-
-Begin = Callable[["TableTopEnvironment", str, np.random.Generator], dict[str, NDArray[Any]]]
-"""``(environment, task, rng) -> first observation of the demonstration``."""
-PAST = 8
-"""Steps that a push continues after success: small position errors must not stop a policy before the triangle."""
-STAY = 4
-"""Steps of rest after a task, so that plans end at rest."""
-
-
-def perform(
-    env: "TableTopEnvironment",
-    task: str,
-    scene: NDArray[np.float32],
-    rng: np.random.Generator,
-    height: float | None = None,
-    feedback: bool = True,
-    scatter: bool = False,
-    begin: Begin | None = None,
-) -> Episode:
-    """Run an episode of a task's expert.
-
-    Args:
-        env: environment, which is reset.
-        task: known task.
-        scene: scene of the task.
-        rng: random generator of style and noise.
-        height, feedback: see :func:`moves`.
-        scatter: whether to move distractors in each image, see :mod:`ftl_lightning.domains.tabletop.distractors`.
-        begin: change of the scene before the demonstration, such as :func:`led_astray`; ``None`` for no change.
-
-    Raises:
-        UserError: for an invalid scene.
-    """
-    seen, info = env.reset(options={"scene": scene})
-    if begin is not None:
-        seen = begin(env, task, rng)
-    how = style(rng)
-    commands, images, poses = [env.command.copy()], [seen[IMAGE]], [seen[POSE]]
-    actions: list[NDArray[np.float32]] = []
-    ended, success = None, False
-    for command in moves(env, task, how, height, feedback):
-        off = TREMBLE * rng.standard_normal(3)
-        angle, size, slips = rng.uniform(-math.pi, math.pi), rng.uniform(*SLIP), rng.random() < SLIPS
-        if slips and task in PUSHES and feedback:  # no recovery without feedback
-            off[:2] += size * np.array([math.cos(angle), math.sin(angle)])
-        actions.append((command + np.array([*off, 0.0])).astype(np.float32))
-        seen, _, terminated, truncated, info = env.step(actions[-1])
-        commands.append(env.command.copy())
-        images.append(seen[IMAGE])
-        poses.append(seen[POSE])
-        done = judged(task, env.scene, info)
-        if ended is None and (terminated or truncated or (done and task in PUSHES)):
-            ended, success = len(actions), done
-        if ended is not None and len(actions) >= ended + (PAST if success and task in PUSHES else 0):
-            break
-    places = None
-    if scatter:
-        pictures, places = scattered(env, task, info["trace"], rng)
-        images, places = list(pictures), _stayed(list(places))
-    return Episode(
-        _stayed(commands).astype(np.float32),
-        np.stack(actions),
-        _stayed(images),
-        _stayed(poses).astype(np.float32),
-        success,
-        places,
-    )
-
-
-def _stayed(values: list[Any]) -> NDArray[Any]:
-    return np.stack([*values, *[values[-1]] * STAY])
-
-
 def led_astray(env: "TableTopEnvironment", task: str, rng: np.random.Generator) -> dict[str, NDArray[Any]]:
     """Start a recovery from a failure: the hand on any side of the circle, low or above it, open or closed and empty in picks.
 
-    With probability :data:`MISLAID` the circle lies elsewhere, also outside its initial range. Open hands are above it.
-
-    Args:
-        env: environment reset to a scene of the task, which is changed.
-        task: known task.
-        rng: random generator.
+    With probability :data:`MISLAID` the circle lies elsewhere, also outside its initial range. Open hands are above it. The
+    environment was reset to a scene of the task, which is changed.
     """
     circle, others = env.places()[CIRCLE], {name: env.outline(name) for name in env.bodies.objects if name != CIRCLE}
     below, picks = support(env.scene, CIRCLE), task not in PUSHES

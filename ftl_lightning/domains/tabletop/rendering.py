@@ -12,9 +12,9 @@ from torch import Tensor
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.execution import Rollout
 from ftl_lightning.domains.films import Shape, VectorFilm, some, still
-from ftl_lightning.domains.tabletop.interface import HERTZ, POSE, THRESHOLD, check_simulator
+from ftl_lightning.domains.tabletop.interface import FRONT, HERTZ, POSE, THRESHOLD, check_simulator
 from ftl_lightning.domains.tabletop.scenes import BOOK, CIRCLE, COLUMNS, HEIGHT, OBJECTS, SIGHT, WHITE, outline, outlines, support
-from ftl_lightning.domains.tabletop.world import ARM, COLOUR, FINGERS, FRONT, TABLE_COLOUR
+from ftl_lightning.domains.tabletop.world import ARM, COLOUR, FINGERS, TABLE_COLOUR
 from ftl_lightning.services.escape import figure_text
 
 MAX_COLUMNS = 4
@@ -25,13 +25,9 @@ _OPEN, _CLOSED = (0, 150, 255), (255, 0, 90)
 
 
 def render(states: Tensor, right: Sequence[bool] | None, title: str, starts: InitialStates | None) -> Figure:
-    """Grid of tables from above with the planned paths of the hand.
+    """Grid of tables from above with the hand's paths of plans ``(sample, horizon, 4)``; without scenes, paths only.
 
-    Args:
-        states: plans ``(sample, horizon, 4)``.
-        right: success per sample (green and red frames); ``None`` for grey frames.
-        title: title of the figure.
-        starts: initial states, whose scenes are drawn; without scenes, paths only.
+    Frames are green for right plans, red for wrong plans, and grey for ``None``.
     """
     columns = min(len(states), MAX_COLUMNS)
     rows = -(-len(states) // columns)
@@ -61,12 +57,7 @@ def _table(axes: Axes, plan: NDArray[np.float32], scene: NDArray[np.float32] | N
 
 
 def film(rollout: Rollout, plans: Tensor) -> list[NDArray[np.uint8]]:
-    """Front views ``(240, 320, 3)`` of an episode with the current plan, at most :data:`FRAMES`.
-
-    Args:
-        rollout: rollout of a single episode.
-        plans: ``(step, horizon, 4)``; blue for an open gripper, red for a closed gripper.
-    """
+    """Front views ``(240, 320, 3)`` of an episode, at most :data:`FRAMES`, with the current of ``plans (step, horizon, 4)``."""
     check_simulator()
     from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
 
@@ -118,10 +109,7 @@ def vector_film(rollout: Rollout) -> VectorFilm:
 
 
 def plan_film(states: Tensor, starts: InitialStates | None) -> VectorFilm:
-    """Vector film of a plan or a demonstration ``(time, 4)`` from the front, with objects at their initial poses, if known.
-
-    A plan does not predict objects: they stay.
-    """
+    """Vector film of a plan or a demonstration ``(time, 4)`` from the front; objects stay at their initial poses, if known."""
     times = some(len(states), SHAPE_FRAMES)
     hand = states.numpy()[times]
     placed = {}

@@ -4,6 +4,7 @@ The robot's base is the origin, the table's top is z = 0. An object has four num
 (x, y, z, yaw).
 """
 
+import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 
@@ -12,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ftl_lightning.domains.tabletop.tasks import (
+from ftl_lightning.domains.tabletop.interface import (
     AROUND_BOWL,
     BESIDE,
     BESIDE_BOWL,
@@ -27,7 +28,7 @@ from ftl_lightning.domains.tabletop.tasks import (
     TO_WHITE,
     check_task,
 )
-from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.errors import UserError, require
 from ftl_lightning.services.seeding import task_key
 
 CIRCLE, TRIANGLE, BOOK, WHITE, BOWL = OBJECTS = ("green circle", "orange triangle", "book", "white surface", "purple bowl")
@@ -124,14 +125,11 @@ def check(scene: Sequence[float] | NDArray[np.float32]) -> NDArray[np.float32]:
             the book, as a whole) or leave the workspace, or a hand outside its initial range.
     """
     array = np.asarray(scene, dtype=np.float32)
-    if array.shape != (SCENE,):
-        raise UserError(f"table-top scene: expected {SCENE} numbers, found shape {array.shape}")
-    if not np.isfinite(array).all():
-        raise UserError("table-top scene: expected finite numbers, found others")
+    require(array.shape == (SCENE,), "table-top scene", f"{SCENE} numbers", f"shape {array.shape}")
+    require(np.isfinite(array).all(), "table-top scene", "finite numbers", "others")
     for name, columns in COLUMNS.items():
-        if array[columns][0] not in (0, 1) or (name == CIRCLE and not array[columns][0]):
-            expected = "1" if name == CIRCLE else "0 or 1"
-            raise UserError(f"table-top scene: {name}, present: expected {expected}, found {array[columns][0]:g}")
+        allowed, present = (1,) if name == CIRCLE else (0, 1), array[columns][0]
+        require(present in allowed, f"table-top scene: {name}, present", " or ".join(map(str, allowed)), f"{present:g}")
     placed = outlines(array)
     for name, points in placed.items():
         free = name in (CIRCLE, TRIANGLE)
@@ -140,26 +138,21 @@ def check(scene: Sequence[float] | NDArray[np.float32]) -> NDArray[np.float32]:
             if values.min() < low - 1e-6 or values.max() > high + 1e-6:
                 outside = values.min() if values.min() < low else values.max()
                 raise UserError(f"table-top scene: {name} leaves the workspace: expected {axis} {low}..{high}, found {outside:.3f}")
-    names = list(placed)
-    for number, name in enumerate(names):
-        for second in names[:number]:
-            _expect_apart(name, second, placed)
+    for second, name in itertools.combinations(placed, 2):
+        if name == BOOK and second in (CIRCLE, TRIANGLE) and within(placed[second], placed[BOOK]):
+            continue  # on the book
+        if (distance := gap(placed[name], placed[second])) < APART:
+            raise UserError(f"table-top scene: {second} and {name} overlap: expected {APART} m between them, found {distance:.3f}")
     for axis, value, (low, high) in zip(("x", "y", "z", "yaw"), array[HAND], START, strict=True):
-        if not low - 1e-6 <= value <= high + 1e-6:
-            raise UserError(f"table-top scene: hand: expected {axis} {low}..{high}, found {value:.3f}")
+        require(low - 1e-6 <= value <= high + 1e-6, "table-top scene: hand", f"{axis} {low}..{high}", f"{value:.3f}")
     return array
 
 
-def _expect_apart(name: str, second: str, placed: Mapping[str, Points]) -> None:
-    if name == BOOK and second in (CIRCLE, TRIANGLE) and within(placed[second], placed[BOOK]):
-        return  # on the book
-    if (distance := gap(placed[name], placed[second])) < APART:
-        raise UserError(f"table-top scene: {second} and {name} overlap: expected {APART} m between them, found {distance:.3f}")
-
-
 Rng = np.random.Generator
-_Placed = dict[str, tuple[float, float, float]]
-"""x, y and yaw by object name."""
+Pose = tuple[float, float, float]
+"""x, y and yaw."""
+_Placed = dict[str, Pose]
+"""Poses by object name."""
 PRESENT = 0.7
 """Probability of a distractor, if it fits; without distractors the image reveals the task."""
 TRIES = 30
@@ -189,10 +182,6 @@ def _pair(rng: Rng, near: float, far: float) -> _Placed:
     angle, distance = rng.uniform(-math.pi, math.pi), rng.uniform(near, far)
     end = (x + distance * math.cos(angle), y + distance * math.sin(angle))
     return {CIRCLE: (x, y, 0.0), TRIANGLE: (float(end[0]), float(end[1]), random_yaw(rng, TRIANGLE))}
-
-
-def _push(rng: Rng) -> _Placed:
-    return _pair(rng, 0.12, 0.24)
 
 
 def _push_to(target: str, near: float, far: float) -> Callable[[Rng], _Placed]:
@@ -231,7 +220,7 @@ NEEDED: Mapping[str, Callable[[Rng], _Placed]] = {
     TO_WHITE: _pick(WHITE),
     BESIDE_BOWL: _pick(BOWL),
     BESIDE_TRIANGLE: _pick(TRIANGLE),
-    PUSH: _push,
+    PUSH: lambda rng: _pair(rng, 0.12, 0.24),
     PUSH_TO_BOWL: _push_to(BOWL, 0.14, 0.26),
     PUSH_TO_WHITE: _push_to(WHITE, 0.17, 0.28),
     PUSH_TO_BOOK: _push_to(BOOK, 0.19, 0.30),
@@ -283,28 +272,21 @@ def draw_scene(task: str, rng: Rng) -> NDArray[np.float32]:
     while True:
         placed = NEEDED[task](rng)
         hand = [float(rng.uniform(*limits)) for limits in START]
-        if _clear(task, placed) and _stands(placed, hand):
+        if _clear(task, placed) and _valid(placed, hand):
             break
     for name in OBJECTS:
         if name in placed or rng.uniform() > PRESENT:
             continue
         for _ in range(TRIES):
             more = {**placed, name: (*anywhere(rng), random_yaw(rng, name))}
-            if _clear(task, more) and _stands(more, hand):
+            if _clear(task, more) and _valid(more, hand):
                 placed = more
                 break
     return scene_of(placed, hand)
 
 
-def scene_of(
-    placed: Mapping[str, tuple[float, float, float]], hand: Sequence[float] = (0.42, 0.0, 0.2, 0.0)
-) -> NDArray[np.float32]:
-    """Assemble the numbers of a scene, without validation.
-
-    Args:
-        placed: x, y and yaw of the present objects.
-        hand: x, y, z and yaw.
-    """
+def scene_of(placed: Mapping[str, Pose], hand: Sequence[float] = (0.42, 0.0, 0.2, 0.0)) -> NDArray[np.float32]:
+    """Numbers of a scene, without validation, from x, y and yaw of the present objects, and x, y, z and yaw of the hand."""
     scene = np.zeros(SCENE, dtype=np.float32)
     for name, pose in placed.items():
         scene[COLUMNS[name]] = (1, *pose)
@@ -312,7 +294,7 @@ def scene_of(
     return scene
 
 
-def _stands(placed: _Placed, hand: Sequence[float]) -> bool:
+def _valid(placed: _Placed, hand: Sequence[float]) -> bool:
     try:
         check(scene_of(placed, hand))
     except UserError:
@@ -321,11 +303,41 @@ def _stands(placed: _Placed, hand: Sequence[float]) -> bool:
 
 
 def scenes(task: str, count: int, seed: int) -> Tensor:
-    """Draw scenes of a task ``(count, 24)``; smaller counts give the first scenes of larger ones.
-
-    Raises:
-        UserError: for an unknown task.
-    """
+    """Draw scenes of a task ``(count, 24)``; smaller counts give the first scenes of larger ones."""
     check_task(task)
     drawn = [draw_scene(task, np.random.default_rng([seed, task_key(task), number])) for number in range(count)]
     return torch.from_numpy(np.stack(drawn))
+
+
+SURFACES = (BOOK, WHITE)
+"""Objects that can carry the triangle."""
+RAISED = 0.5
+"""Probability of a triangle on a surface, if one is visible."""
+
+HIDDEN: Pose = (-5.0, 0.0, 0.0)
+"""Position of objects that an image does not show."""
+
+
+def free_pose(rng: np.random.Generator, name: str, taken: Mapping[str, Points]) -> tuple[float, Pose]:
+    """Draw height and pose of a distractor without overlap; :data:`HIDDEN` if none fits. The triangle may lie on a surface."""
+    below = [surface for surface in SURFACES if surface in taken] if name == TRIANGLE else []
+    if below and rng.uniform() < RAISED:
+        under = below[rng.integers(len(below))]
+        low, high = taken[under].min(axis=0), taken[under].max(axis=0)
+        for _ in range(TRIES):
+            x, y = map(float, rng.uniform(low, high))
+            pose = (x, y, random_yaw(rng, name))
+            points = outline(name, *pose)
+            if within(points, taken[under]) and _apart(points, {key: shape for key, shape in taken.items() if key != under}):
+                return HEIGHT[under], pose
+    low, high = np.transpose(SIGHT)
+    for _ in range(TRIES):
+        pose = (*anywhere(rng), random_yaw(rng, name))
+        points = outline(name, *pose)
+        if (points > low).all() and (points < high).all() and _apart(points, taken):
+            return 0.0, pose
+    return 0.0, HIDDEN
+
+
+def _apart(points: Points, taken: Mapping[str, Points]) -> bool:
+    return all(gap(points, shape) >= APART for shape in taken.values())

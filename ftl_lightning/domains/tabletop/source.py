@@ -1,46 +1,183 @@
 """Demonstrations of scripted experts."""
 
 import logging
+import math
 import multiprocessing
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from ftl_lightning.data.demonstrations import Demonstrations, concatenate, padded
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.data.formats.files import cached
 from ftl_lightning.domains.domain import Split
-from ftl_lightning.domains.tabletop import distractors, environment, experts, pushing, success, world
-from ftl_lightning.domains.tabletop import scenes as scene_settings
-from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
-from ftl_lightning.domains.tabletop.experts import Episode, led_astray, perform
-from ftl_lightning.domains.tabletop.interface import FEATURES, IMAGE, NAME, PLACES, POSE, STATE_NAMES, STATE_UNITS
-from ftl_lightning.domains.tabletop.scenes import draw_scene, scenes
-from ftl_lightning.domains.tabletop.tasks import PUSH, PUSHES, TRAINING_CONCEPTS, check_task
-from ftl_lightning.services.errors import UserError
+from ftl_lightning.domains.tabletop import environment, experts, world
+from ftl_lightning.domains.tabletop import scenes as layouts
+from ftl_lightning.domains.tabletop.environment import TableTopEnvironment, judged
+from ftl_lightning.domains.tabletop.experts import PAST, SLIP, SLIPS, STAY, TREMBLE, led_astray, moves, style
+from ftl_lightning.domains.tabletop.interface import (
+    FEATURES,
+    IMAGE,
+    NAME,
+    OVERHEAD,
+    PLACES,
+    POSE,
+    PUSH,
+    PUSHES,
+    STATE_NAMES,
+    STATE_UNITS,
+    TRAINING_CONCEPTS,
+    Camera,
+    check_task,
+)
+from ftl_lightning.domains.tabletop.scenes import HEIGHT, HIDDEN, NEEDED, PRESENT, SURFACES, draw_scene, free_pose, outline, scenes
+from ftl_lightning.domains.tabletop.world import turned
+from ftl_lightning.services.errors import require
 from ftl_lightning.services.seeding import VALIDATION_SEED, task_key
 
 _LOG = logging.getLogger(__name__)
 
 MOST = 4
 """Maximum attempts per demonstration."""
-FORM = 5
+VERSION = 5
 """Version of the experts; part of the cache key."""
 TIMES = {PUSH: 4}
 """Factors of the demonstrations per training concept: the paper has 124 of the push, 29 to 31 of others."""
 RECOVERY_SEED = 2_000_000
 """Seed offset of recovery demonstrations."""
 _NO_SETTINGS = ("ROUND", "FEATURES", "NEEDED", "TYPE_CHECKING")
+"""Constants without influence on a demonstration."""
 _SETTINGS = {
     f"{module.__name__.rpartition('.')[2]}.{name}": value
-    for module in (distractors, environment, experts, pushing, scene_settings, success, world)
+    for module in (environment, experts, layouts, world)
     for name, value in sorted(vars(module).items())
-    if name.isupper() and isinstance(value, int | float | str | tuple | dict | world.Camera) and name not in _NO_SETTINGS
+    if name.isupper() and isinstance(value, int | float | str | tuple | dict | Camera) and name not in _NO_SETTINGS
 }
 """Constants that determine a demonstration, besides task, count and seed."""
+
+
+@dataclass(frozen=True)
+class Episode:
+    """Episode of an expert.
+
+    Attributes:
+        commands: ``(time, 4)``, executed commands; the first is the initial state.
+        actions: ``(steps, 4)``, actions passed to the environment, which shortens moves that are too far.
+        images: ``(time, 3, 64, 64)`` uint8.
+        poses: ``(time, 8)``, measured.
+        success: whether the task is done.
+        places: ``(time, 5, 4)``, object positions in the images; only with scattered distractors.
+    """
+
+    commands: NDArray[np.float32]
+    actions: NDArray[np.float32]
+    images: NDArray[np.uint8]
+    poses: NDArray[np.float32]
+    success: bool
+    places: NDArray[np.float32] | None = None
+
+
+Begin = Callable[[TableTopEnvironment, str, np.random.Generator], dict[str, NDArray[Any]]]
+"""``(environment, task, rng) -> first observation of the demonstration``."""
+
+
+def scattered(
+    env: TableTopEnvironment, task: str, trace: Sequence[NDArray[np.float64]], rng: np.random.Generator
+) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """Images ``(time, 3, 64, 64)`` of the overhead camera of a finished episode, and object positions.
+
+    Few demonstrations have few layouts, and a network memorises demonstrations by their distractors. Random distractors carry no
+    information (domain randomisation, Tobin et al., 2017). The triangle also lies on book and block, where it looks larger.
+
+    Args:
+        env: environment of the episode; its objects are moved.
+        task: known task.
+        trace: ``trace`` of the episode's last info.
+        rng: random generator of positions and visibility.
+
+    Returns:
+        Images, and positions ``(time, 5, 4)``, see :meth:`.TableTopEnvironment.seen`.
+    """
+    needed = NEEDED[task](np.random.default_rng(0))
+    objects = env.bodies.objects
+    others = sorted((name for name in objects if name not in needed), key=lambda name: name not in SURFACES)
+    pictures, places = [], []
+    for moment in trace:
+        env.show(moment)
+        taken = {name: env.outline(name) for name in objects if name in needed}
+        for name in others:
+            base, (x, y, yaw) = 0.0, HIDDEN
+            if rng.uniform() < PRESENT:
+                base, (x, y, yaw) = free_pose(rng, name, taken)
+            env.client.resetBasePositionAndOrientation(objects[name], (x, y, base + HEIGHT[name] / 2), turned(yaw))
+            if x != HIDDEN[0]:
+                taken[name] = outline(name, x, y, yaw)
+        pictures.append(OVERHEAD.picture(env.client).transpose(2, 0, 1))
+        places.append(env.seen())
+    return np.stack(pictures), np.stack(places)
+
+
+def perform(
+    env: TableTopEnvironment,
+    task: str,
+    scene: NDArray[np.float32],
+    rng: np.random.Generator,
+    height: float | None = None,
+    feedback: bool = True,
+    scatter: bool = False,
+    begin: Begin | None = None,
+) -> Episode:
+    """Run an episode of a task's expert.
+
+    Args:
+        env: environment, which is reset.
+        task: known task.
+        scene: scene of the task.
+        rng: random generator of style and noise.
+        height, feedback: see :func:`moves`.
+        scatter: whether to move distractors in each image, see :mod:`ftl_lightning.domains.tabletop.source`.
+        begin: change of the scene before the demonstration, such as :func:`led_astray`; ``None`` for no change.
+
+    Raises:
+        UserError: for an invalid scene.
+    """
+    seen, info = env.reset(options={"scene": scene})
+    if begin is not None:
+        seen = begin(env, task, rng)
+    how = style(rng)
+    commands, images, poses = [env.command.copy()], [seen[IMAGE]], [seen[POSE]]
+    actions: list[NDArray[np.float32]] = []
+    ended, success = None, False
+    for command in moves(env, task, how, height, feedback):
+        off = TREMBLE * rng.standard_normal(3)
+        angle, size, slips = rng.uniform(-math.pi, math.pi), rng.uniform(*SLIP), rng.random() < SLIPS
+        if slips and task in PUSHES and feedback:  # no recovery without feedback
+            off[:2] += size * np.array([math.cos(angle), math.sin(angle)])
+        actions.append((command + np.array([*off, 0.0])).astype(np.float32))
+        seen, _, terminated, truncated, info = env.step(actions[-1])
+        commands.append(env.command.copy())
+        images.append(seen[IMAGE])
+        poses.append(seen[POSE])
+        done = judged(task, env.scene, info)
+        if ended is None and (terminated or truncated or (done and task in PUSHES)):
+            ended, success = len(actions), done
+        if ended is not None and len(actions) >= ended + (PAST if success and task in PUSHES else 0):
+            break
+    places = None
+    if scatter:
+        pictures, places = scattered(env, task, info["trace"], rng)
+        images, places = list(pictures), _stayed(list(places))
+    states, measured = _stayed(commands).astype(np.float32), _stayed(poses).astype(np.float32)
+    return Episode(states, np.stack(actions), _stayed(images), measured, success, places)
+
+
+def _stayed(values: list[Any]) -> NDArray[Any]:
+    return np.stack([*values, *[values[-1]] * STAY])
+
 
 Job = tuple[str, int, int, bool, bool]
 """Task, seed, episode number, whether distractors are scattered in each image, and whether the episode is a recovery."""
@@ -54,12 +191,7 @@ def _scene(job: Job) -> np.ndarray:
 
 
 def _episode(job: Job) -> Episode | None:
-    """Run an episode of the expert; ``None`` if the simulator raised an error.
-
-    Raises:
-        MemoryError, OSError: for a lack of resources, which would affect every episode.
-        UserError: if the simulator does not start.
-    """
+    """Run an episode of the expert; ``None`` if the simulator raised an error, except for a lack of resources."""
     task, seed, number, scatter, elsewhere = job
     if not _ENVIRONMENT:
         _ENVIRONMENT.append(TableTopEnvironment())
@@ -95,9 +227,7 @@ def demonstrations(
 
     Args:
         task: known task.
-        count: number of demonstrations.
-        seed: seed of scenes, styles and noise.
-        workers: number of processes.
+        count, seed, workers: numbers of demonstrations and processes, and seed of scenes, styles and noise.
         progress: called after each successful episode.
         scatter: whether to scatter distractors in each image, with object positions as a privileged feature.
         elsewhere: whether episodes are recoveries, with the hand anywhere around the circle.
@@ -115,8 +245,7 @@ def demonstrations(
             progress()
         if len(kept) == count:
             break
-    else:
-        raise UserError(f"table-top {task!r}: expected {count} successful episodes of {tried}, found {len(kept)}")
+    require(len(kept) == count, f"table-top {task!r}", f"{count} successful episodes of {tried}", len(kept))
     drawn = torch.from_numpy(np.stack([_scene(job) for job, _ in kept]))
     provenance = {"generator": NAME, "seed": seed, "count": count, "tried": tried, "rejected": tried - count}
     return joined_episodes(task, [episode for _, episode in kept], drawn, provenance)
@@ -125,20 +254,14 @@ def demonstrations(
 def joined_episodes(
     task: str, episodes: Sequence[Episode], drawn: torch.Tensor | None, provenance: Mapping[str, Any]
 ) -> Demonstrations:
-    """Demonstrations from episodes of a task.
-
-    Args:
-        task: known task.
-        episodes: all with places, or none.
-        drawn: their scenes ``(episode, 24)``; ``None`` if they did not start from a scene.
-        provenance: record of their origin.
-    """
-    observed = {
-        IMAGE: padded([torch.from_numpy(episode.images) for episode in episodes])[0],
-        POSE: padded([torch.from_numpy(episode.poses) for episode in episodes])[0],
+    """Demonstrations from episodes of a task, and their scenes ``(episode, 24)``, if any; all have places, or none has."""
+    places = [episode.places for episode in episodes if episode.places is not None]
+    columns: dict[str, list[NDArray[Any]]] = {
+        IMAGE: [episode.images for episode in episodes],
+        POSE: [episode.poses for episode in episodes],
     }
-    if places := [torch.from_numpy(episode.places) for episode in episodes if episode.places is not None]:
-        observed[PLACES] = padded(places)[0]
+    columns |= {PLACES: places} if places else {}
+    observed = {name: padded([torch.from_numpy(values) for values in rows])[0] for name, rows in columns.items()}
     states, lengths = padded([torch.from_numpy(episode.commands) for episode in episodes])
     return Demonstrations(
         states=states,
@@ -183,7 +306,7 @@ class Expert:
         self, task: str, count: int, seed: int, workers: int = 1, scatter: bool = False, elsewhere: bool = False
     ) -> Demonstrations:
         """``count`` demonstrations of a task, see :func:`demonstrations`."""
-        settings = {"domain": NAME, "task": check_task(task), "count": count, "seed": seed, "experts": FORM, **_SETTINGS}
+        settings = {"domain": NAME, "task": check_task(task), "count": count, "seed": seed, "experts": VERSION, **_SETTINGS}
         settings |= {"scatter": scatter, "elsewhere": elsewhere}
         made = cached(settings, count, lambda progress: demonstrations(task, count, seed, workers, progress, scatter, elsewhere))
         return made if made.domain == self.domain else replace(made, domain=self.domain)

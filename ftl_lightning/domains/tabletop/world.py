@@ -1,4 +1,4 @@
-"""Pybullet bodies and cameras of the table-top."""
+"""Pybullet bodies of the table-top."""
 
 import math
 from dataclasses import dataclass
@@ -59,25 +59,14 @@ Pose = tuple[tuple[float, float, float], tuple[float, float, float, float]]
 
 @dataclass(frozen=True)
 class Bodies:
-    """Body identifiers in the simulator.
-
-    Attributes:
-        robot: arm.
-        objects: present objects by name.
-    """
+    """Body identifiers in the simulator: the arm, and present objects by name."""
 
     robot: int
     objects: dict[str, int]
 
 
 def build(client: Simulator, scene: NDArray[np.float32], arm_drawn: bool) -> Bodies:
-    """Build a scene after a full reset of the simulator.
-
-    Args:
-        client: simulator.
-        scene: valid scene.
-        arm_drawn: whether images show the arm; without it they take a twentieth of the time.
-    """
+    """Build a valid scene after a full reset of the simulator; without the arm, images take a twentieth of the time."""
     client.resetSimulation()
     client.setGravity(0, 0, -9.81)
     client.setPhysicsEngineParameter(fixedTimeStep=STEP, deterministicOverlappingPairs=1)
@@ -144,9 +133,9 @@ def _object(client: Simulator, scene: NDArray[np.float32], name: str, edged: boo
             drawn = _edged(_corners(RADIUS[name], height / 2, ROUND))
             seen = client.createVisualShape(pybullet().GEOM_MESH, **drawn, rgbaColor=colour)
     elif name == TRIANGLE:
-        vertices = _prism(RADIUS[name] - 2 * MARGIN, height / 2 - MARGIN)  # corners move twice as far as sides
+        vertices = _corners(RADIUS[name] - 2 * MARGIN, height / 2 - MARGIN, 3).tolist()  # corners move twice as far as sides
         shape = client.createCollisionShape(pybullet().GEOM_MESH, vertices=vertices)
-        smooth: dict[str, list[Any]] = {"vertices": _prism(RADIUS[name], height / 2), "indices": _PRISM_SIDES}
+        smooth: dict[str, list[Any]] = {"vertices": _corners(RADIUS[name], height / 2, 3).tolist(), "indices": _PRISM_SIDES}
         drawn = _edged(_corners(RADIUS[name], height / 2, 3)) if edged else smooth
         seen = client.createVisualShape(pybullet().GEOM_MESH, **drawn, rgbaColor=colour)
     else:
@@ -161,11 +150,6 @@ def _object(client: Simulator, scene: NDArray[np.float32], name: str, edged: boo
     return body
 
 
-def _prism(radius: float, half: float) -> list[list[float]]:
-    corners = [(radius * math.cos(angle), radius * math.sin(angle)) for angle in (0, 2 * math.pi / 3, 4 * math.pi / 3)]
-    return [[x, y, z] for z in (-half, half) for x, y in corners]
-
-
 ROUND = 48
 """Corners of a circle drawn with edges."""
 
@@ -178,11 +162,7 @@ def _corners(radius: float, half: float, count: int) -> NDArray[np.float64]:
 
 
 def _edged(corners: NDArray[np.float64]) -> dict[str, list[Any]]:
-    """Arguments of a visual shape of an upright prism without shared vertices, so that no shading crosses an edge.
-
-    Args:
-        corners: ``(2 * count, 3)``, lower face first.
-    """
+    """Arguments of a visual shape of an upright prism without shared vertices, so that no shading crosses an edge."""
     count = len(corners) // 2
     below, above = corners[:count], corners[count:]
     faces = [(above[0], above[i], above[i + 1]) for i in range(1, count - 1)]
@@ -214,47 +194,3 @@ def _bowl_shape(client: Simulator) -> int:
         collisionFrameOrientations=[*(turned(angle) for angle in angles), turned(0.0)],
     )
     return shape
-
-
-@dataclass(frozen=True)
-class Camera:
-    """Fixed camera.
-
-    Attributes:
-        eye, target, up: metres.
-        angle: vertical field of view in degrees.
-        size: height and width of images.
-    """
-
-    eye: tuple[float, float, float]
-    target: tuple[float, float, float]
-    up: tuple[float, float, float]
-    angle: float
-    size: tuple[int, int]
-
-    def _matrices(self) -> tuple[list[float], list[float]]:
-        view = pybullet().computeViewMatrix(self.eye, self.target, self.up)
-        return view, pybullet().computeProjectionMatrixFOV(self.angle, self.size[1] / self.size[0], 0.1, 3.0)
-
-    def picture(self, client: Simulator, shadow: bool = False) -> NDArray[np.uint8]:
-        """Image ``(height, width, 3)`` of pybullet's software renderer."""
-        height, width = self.size
-        view, lens = self._matrices()
-        seen = client.getCameraImage(
-            width, height, view, lens, lightDirection=[0.3, -0.6, 1.5], shadow=int(shadow), renderer=pybullet().ER_TINY_RENDERER
-        )
-        rgba: NDArray[np.uint8] = np.asarray(seen[2], dtype=np.uint8).reshape(height, width, 4)
-        return np.ascontiguousarray(rgba[..., :3])
-
-    def pixels(self, places: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Column and row ``(n, 2)`` of points ``(n, 3)`` in an image."""
-        view, lens = (np.array(matrix).reshape(4, 4).T for matrix in self._matrices())
-        clip = np.concatenate((places, np.ones((len(places), 1))), axis=-1) @ (lens @ view).T
-        seen = clip[:, :2] / clip[:, 3:]
-        return (np.array([1, 1]) + seen * (1, -1)) / 2 * (self.size[1], self.size[0])
-
-
-OVERHEAD = Camera((0.5, 0.0, 0.85), (0.5, 0.0, 0.0), (1.0, 0.0, 0.0), 45.0, (64, 64))
-"""Camera of the model."""
-FRONT = Camera((1.15, 0.0, 0.65), (0.53, 0.0, 0.05), (-1.0, 0.0, 1.0), 36.0, (240, 320))
-"""Camera of films."""
