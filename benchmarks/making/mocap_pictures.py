@@ -17,7 +17,7 @@ from ftl_lightning.domains.mocap.rendering import film
 from ftl_lightning.domains.mocap.skeleton import L_ANKLE, R_ANKLE, as_joints
 from ftl_lightning.domains.mocap.source import POSE
 from ftl_lightning.domains.mocap.standing import standing_poses, walking_poses
-from ftl_lightning.evaluation.animation import gif, side_by_side
+from ftl_lightning.evaluation.pictures import gif, side_by_side
 from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.services.tensor_file import atomic
 

@@ -36,7 +36,7 @@ ACCURACY = "accuracy"
 SUCCESS = "success"
 NOVELTY, COVERAGE = "novelty", "coverage"
 """Distances of generated plans to demonstrations and of fresh behaviour to generated plans, in every domain, see
-:mod:`ftl_lightning.evaluation.diversity`; a metric of a domain's own by one of these names stands in its place."""
+:mod:`ftl_lightning.evaluation.references`; a metric of a domain's own by one of these names stands in its place."""
 CLOSED = "closed loop"
 EXECUTED = f"{CLOSED} {SUCCESS}"
 Split = Literal["train", "validation"]

@@ -49,11 +49,11 @@ from ftl_lightning.training.demonstration_check import Check, check_with, warnin
 from ftl_lightning.training.hub import CONCEPT_FILES, download, is_repository, save_with_card, upload
 from ftl_lightning.training.inversion import Watch
 from ftl_lightning.training.inversion_settings import INVERSION
-from ftl_lightning.training.judging import judged, judging_domain, picture
 from ftl_lightning.training.learner import Learner
 from ftl_lightning.training.library import Library, library
 from ftl_lightning.training.longer import longer_than_plans
 from ftl_lightning.training.pretrained import load_model
+from ftl_lightning.training.quality import judged, judging_domain, picture
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -22,11 +22,10 @@ from ftl_lightning.services.targets import check_writable_file
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.data import InversionData
 from ftl_lightning.training.demonstration_check import warnings_of
-from ftl_lightning.training.judging import judging_domain
 from ftl_lightning.training.longer import longer_than_plans
 from ftl_lightning.training.methods import adapts, kinds_for
 from ftl_lightning.training.pretrained import load_model
-from ftl_lightning.training.quality import inspected
+from ftl_lightning.training.quality import inspected, judging_domain
 
 
 class Adaptation(pl.LightningModule, ABC):

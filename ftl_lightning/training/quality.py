@@ -1,19 +1,21 @@
-"""Quality of samples relative to demonstrations: measures and their description in words."""
+"""Judgement of plans by a domain's metrics, and quality of samples relative to demonstrations."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Self
 
 import torch
 from torch import Tensor
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.container import Demonstrations, concatenate
 from ftl_lightning.data.features import InitialStates, moved
 from ftl_lightning.domains.beside import Drawn, beside
 from ftl_lightning.domains.distances import path_distance
 from ftl_lightning.domains.domain import Domain
+from ftl_lightning.domains.from_file import own_domain
 from ftl_lightning.igm.concept import Concept, QualityRecord
 from ftl_lightning.igm.samplers import Sampling
+from ftl_lightning.services.errors import require
 from ftl_lightning.services.seeding import generator, task_key
 from ftl_lightning.training.concept_model import ConceptModel
 
@@ -31,6 +33,52 @@ SAMPLING = Sampling("dpm_solver", 10, 1.0)
 SMOOTH = 0.01
 """Minimum visible roughness: second differences relative to the size of a plan."""
 _LEAST = 1e-9
+
+
+def right_plans(measured: Mapping[str, Tensor]) -> tuple[str, Tensor] | None:
+    """Which plans are right: the first boolean metric per plan.
+
+    Args:
+        measured: values of a domain's metrics by name, see :meth:`~ftl_lightning.domains.domain.Domain.measure`.
+
+    Returns:
+        Name and values ``(sample,)`` of the metric; ``None`` without such a metric.
+    """
+    return next(((name, values) for name, values in measured.items() if values.dtype == torch.bool and values.dim()), None)
+
+
+def judging_domain(model: ConceptModel, examples: Sequence[Demonstrations]) -> Domain:
+    """A model's domain; for a user's data, including demonstrations of learned concepts."""
+    if model.examples is None:
+        return model.domain
+    config = model.config
+    return own_domain(concatenate(examples), config.training_concepts, config.horizon, config.metrics)
+
+
+def judged(domain: Domain, plans: Demonstrations, goal: str) -> dict[str, float]:
+    """Evaluate plans by the domain's metrics: success rates or means by name.
+
+    Raises:
+        UserError: for a goal that the domain cannot judge, or a domain without metrics.
+    """
+    require(domain.metrics, "evaluate", "a domain that judges plans", f"{domain.name}; execute them")
+    domain.check_goal(goal)
+    measured = domain.measure(goal, plans.states, plans.initial_states)
+    return {name: float(values.float().mean()) for name, values in measured.items()}
+
+
+def picture(domain: Domain, plans: Demonstrations, goal: str = "") -> "Figure":
+    """Draw plans; with a goal, right plans are framed green and wrong plans red.
+
+    Raises:
+        UserError: for a goal that the domain cannot judge.
+    """
+    starts, right = plans.initial_states, None
+    if goal:
+        domain.check_goal(goal)
+        right = right_plans(domain.measure(goal, plans.states, starts))
+    framed = None if right is None else right[1].tolist()
+    return domain.show.picture(plans.states, framed, goal or "samples", starts if domain.observed else None)
 
 
 @dataclass(frozen=True)
@@ -72,18 +120,19 @@ class Quality:
         return cls(
             novelty=_share(new.amin(dim=1).mean(), among),
             spread=_share(samples.var(dim=0).mean().sqrt(), demonstrations.var(dim=0).mean().sqrt()),
-            roughness=_roughness_share(samples, demonstrations) if samples.shape[1] > 2 else 1.0,
+            roughness=float(_visible_roughness(samples) / _visible_roughness(demonstrations)) if samples.shape[1] > 2 else 1.0,
         )
 
     @property
     def words(self) -> str:
         """Description, such as ``'spread 0.31 (collapsed)'``; without a remark within the thresholds."""
-        words = [
-            f"spread {self.spread:.2f}{_remark(self.spread, COLLAPSED, 'collapsed', SCATTERED, 'scattered')}",
-            f"novelty {self.novelty:.2f}{_remark(self.novelty, COPIES, 'copies')}",
-            f"roughness {self.roughness:.2f}{_remark(self.roughness, 0, '', ROUGH, 'rougher than your demonstrations')}",
-        ]
-        return ", ".join(words)
+        spread = "collapsed" if self.spread < COLLAPSED else "scattered" if self.spread > SCATTERED else ""
+        remarks = {
+            f"spread {self.spread:.2f}": spread,
+            f"novelty {self.novelty:.2f}": "copies" if self.novelty < COPIES else "",
+            f"roughness {self.roughness:.2f}": "rougher than your demonstrations" if self.roughness > ROUGH else "",
+        }
+        return ", ".join(f"{measure} ({remark})" if remark else measure for measure, remark in remarks.items())
 
     @property
     def numbers(self) -> Mapping[str, float]:
@@ -101,18 +150,13 @@ def roughness(plans: Tensor) -> Tensor:
     return (second[moving] / size[moving]).median() if moving.any() else size.new_zeros(())
 
 
-def _roughness_share(samples: Tensor, demonstrations: Tensor) -> float:
-    sampled, demonstrated = (roughness(plans).clamp(min=SMOOTH) for plans in (samples, demonstrations))
-    return float(sampled / demonstrated)
+def _visible_roughness(plans: Tensor) -> Tensor:
+    return roughness(plans).clamp(min=SMOOTH)
 
 
 def _share(value: Tensor, whole: Tensor) -> float:
     """Ratio; 1 if both are 0."""
     return float(value / whole) if whole > _LEAST else 1.0 if value <= _LEAST else float(value / _LEAST)
-
-
-def _remark(value: float, least: float, below: str, most: float = torch.inf, above: str = "") -> str:
-    return f" ({below})" if value < least else f" ({above})" if value > most else ""
 
 
 def measured(model: ConceptModel, demonstrations: Demonstrations, concepts: Mapping[str, Concept], seed: int) -> dict[str, Quality]:
@@ -126,7 +170,8 @@ def measured(model: ConceptModel, demonstrations: Demonstrations, concepts: Mapp
     """
     known = _encoded(model, *first_windows(demonstrations, model.config.horizon))
     plans, starts = generated(model, demonstrations, concepts, seed)
-    return {name: Quality.of(_encoded(model, samples, starts), known, _observed(demonstrations)) for name, samples in plans.items()}
+    observed = _turns(demonstrations) if demonstrations.observed else None
+    return {name: Quality.of(_encoded(model, samples, starts), known, observed) for name, samples in plans.items()}
 
 
 def generated(
@@ -146,11 +191,6 @@ def generated(
 def _turns(demonstrations: Demonstrations) -> Tensor:
     """Index of the demonstration with each sample's initial state ``(GENERATED,)``."""
     return torch.arange(GENERATED) % len(demonstrations)
-
-
-def _observed(demonstrations: Demonstrations) -> Tensor | None:
-    """The same; ``None`` without observations."""
-    return _turns(demonstrations) if demonstrations.observed else None
 
 
 def first_windows(demonstrations: Demonstrations, horizon: int) -> tuple[Tensor, InitialStates]:
@@ -216,11 +256,12 @@ def inspected(model: ConceptModel, domain: Domain, demonstrations: Demonstration
         seed: seed of the samples.
     """
     name = concept.origin.name
-    every, starts = generated(model, demonstrations, {name: concept}, seed)
-    plans, (known, first) = every[name], first_windows(demonstrations, model.config.horizon)
+    samples, starts = generated(model, demonstrations, {name: concept}, seed)
+    plans, (known, first) = samples[name], first_windows(demonstrations, model.config.horizon)
     right = None
-    if domain.metrics and domain.concepts.reads(name):
-        measured = domain.measure(name, plans, starts if domain.observed else None)
-        right = next(((key, float(values.float().mean())) for key, values in measured.items() if values.dtype == torch.bool), None)
-    quality = Quality.of(_encoded(model, plans, starts), _encoded(model, known, first), _observed(demonstrations))
-    return Inspection(quality, right, known, plans, starts, domain, name)
+    if domain.concepts.reads(name):
+        right = right_plans(domain.measure(name, plans, starts if domain.observed else None))
+    observed = _turns(demonstrations) if demonstrations.observed else None
+    quality = Quality.of(_encoded(model, plans, starts), _encoded(model, known, first), observed)
+    success = None if right is None else (right[0], float(right[1].float().mean()))
+    return Inspection(quality, success, known, plans, starts, domain, name)

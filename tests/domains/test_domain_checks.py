@@ -12,7 +12,7 @@ from ftl_lightning.domains.object_rearrangement import DOMAIN
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.domains.tasks import EvaluationTask
-from ftl_lightning.evaluation.judged import TaskResult
+from ftl_lightning.evaluation.generation import TaskResult
 from ftl_lightning.evaluation.references import references
 from ftl_lightning.services.errors import UserError
 
@@ -42,7 +42,7 @@ def test_metrics_judges_and_reference_lines_of_another_shape_are_refused() -> No
     domain = replace(DOMAIN, name="other", references={"mine": lambda goal, count, starts, seed: torch.zeros(count, 2, 21)})
     one = TaskResult.of(EvaluationTask("s", GOAL), STATES, None, domain)
     with pytest.raises(UserError, match=r"reference 'mine': expected plans \(5, 1, 21\), found \(5, 2, 21\)"):
-        references([one], domain, lambda concept: None, 0)
+        references([one], domain, 0)
 
 
 def test_a_misspelt_goal_is_told_with_goals_that_are_near() -> None:

@@ -6,7 +6,7 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image, ImageSequence
 
-from ftl_lightning.evaluation.animation import captioned, frame_milliseconds, gif, outcome_text
+from ftl_lightning.evaluation.pictures import captioned, frame_milliseconds, gif, outcome_text
 
 
 def pictures(count: int) -> list[NDArray[np.uint8]]:

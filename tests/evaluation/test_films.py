@@ -15,7 +15,7 @@ from ftl_lightning.domains.registry import domain_names, load_domain
 from ftl_lightning.domains.vector_film import Shape, VectorFilm, still
 from ftl_lightning.domains.wireframe import Wireframe
 from ftl_lightning.evaluation.closed_loop import PlanFollower, fixed_plans, roll_out
-from ftl_lightning.evaluation.films import ABSENT, STEPS, packed, packed_space
+from ftl_lightning.evaluation.pictures import ABSENT, STEPS, packed, packed_space
 from ftl_lightning.evaluation.results import read_rows
 
 

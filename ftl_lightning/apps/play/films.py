@@ -12,7 +12,7 @@ from ftl_lightning.domains.domain import SUCCESS, Domain, Show
 from ftl_lightning.domains.line_plots import line_film
 from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.domains.vector_film import VectorFilm
-from ftl_lightning.evaluation.films import packed, packed_space
+from ftl_lightning.evaluation.pictures import packed, packed_space
 
 Json = dict[str, Any]
 

@@ -13,7 +13,7 @@ from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.from_file import own_domain, warped_distances
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.domains.tasks import EvaluationTask
-from ftl_lightning.evaluation.diversity import FRESH, REPLAYED, Real, coverage, lines, novelty
+from ftl_lightning.evaluation.references import FRESH, REPLAYED, Real, coverage, lines, novelty
 from ftl_lightning.evaluation.results import read_rows
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.seeding import DEMONSTRATION_SEED
