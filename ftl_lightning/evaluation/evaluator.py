@@ -126,7 +126,7 @@ class Evaluator(pl.Callback):
         means: dict[str, float] = {}
         if trainer.is_global_zero:  # rank 0 evaluates, the other ranks wait
             self.judged = generate(module, self._tasks(module, data), self.generation, data.root)
-            means = setting_means({(result.task.setting, result.task.name): result.values for result in self.judged})
+            means = setting_means((done.task.setting, *measured) for done in self.judged for measured in done.values.items())
         # Synchronise the global generators, from which a domain's evaluation may draw.
         means, random = trainer.strategy.broadcast((means, Random.now(pl_module.device, 0)))
         if not trainer.is_global_zero:

@@ -31,31 +31,39 @@ WON, LOST = "won against ", "lost against "
 
 
 class Evaluable(Protocol):
-    """Module with a model, names of method, form, variant and learned concepts, and points of concept space."""
+    """Module whose behaviour is evaluated."""
 
     model: ConceptModel
     hparams: Any
 
     @property
-    def domain(self) -> Domain: ...
+    def domain(self) -> Domain:
+        """Domain that judges."""
 
     @property
-    def method(self) -> str: ...
+    def method(self) -> str:
+        """Name of the method."""
 
     @property
-    def form(self) -> str: ...
+    def form(self) -> str:
+        """Form of the method."""
 
     @property
-    def variant(self) -> str: ...
+    def variant(self) -> str:
+        """Label of the settings."""
 
     @property
-    def concepts(self) -> tuple[str, ...]: ...
+    def concepts(self) -> tuple[str, ...]:
+        """Names of the learned concepts."""
 
-    def composition(self, task: EvaluationTask) -> Composition | None: ...
+    def composition(self, task: EvaluationTask) -> Composition | None:
+        """Composition of a task; ``None`` if a concept was not learned."""
 
-    def demonstrated(self, concept: str) -> Demonstrations | None: ...
+    def demonstrated(self, concept: str) -> Demonstrations | None:
+        """Demonstrations of a learned concept."""
 
-    def concept_points(self) -> list[Point]: ...
+    def concept_points(self) -> list[Point]:
+        """Points of concept space."""
 
 
 def evaluable(module: object) -> Evaluable:

@@ -55,20 +55,17 @@ def frame_milliseconds(count: int, seconds: float | None = None) -> int:
     return max(10 * round(100 * each), 20)
 
 
-def gif(
-    pictures: Sequence[NDArray[np.uint8]], seconds: float | None = None, pause: float = END_SECONDS, colours: int = COLOURS
-) -> bytes:
+def gif(pictures: Sequence[NDArray[np.uint8]], seconds: float | None = None, colours: int = COLOURS) -> bytes:
     """Encode an endless animation.
 
     Args:
         pictures: ``(height, width, 3)`` each, of equal size.
-        seconds: total duration; ``None`` for a readable speed.
-        pause: additional seconds of the last picture.
+        seconds: duration without the pause at the end; ``None`` for a readable speed.
         colours: number of colours per picture, up to 256.
     """
     first, *rest = (Image.fromarray(picture).quantize(colours) for picture in pictures)
     each = frame_milliseconds(len(pictures), seconds)
-    durations = [*[each] * len(rest), each + 10 * round(100 * pause)]
+    durations = [*[each] * len(rest), each + 10 * round(100 * END_SECONDS)]
     content = io.BytesIO()
     first.save(content, "GIF", save_all=True, append_images=rest, duration=durations, loop=0)
     return content.getvalue()

@@ -143,28 +143,13 @@ class Real:
     fresh: tuple[Demonstrations, Demonstrations] | None = None
 
     @classmethod
-    def of(
-        cls,
-        task: EvaluationTask,
-        domain: Domain,
-        count: int,
-        demonstrations: Demonstrations | None,
-        root: Path | None = None,
-        seed: int = 0,
-    ) -> Self:
-        """Collect the real behaviour of a task.
+    def of(cls, generated: TaskResult, domain: Domain, root: Path | None = None, seed: int = 0) -> Self:
+        """Collect the real behaviour of a task; arguments as in :func:`real_behaviour`.
 
         Novelty applies if the demonstrations show the task itself, not to compositions with training concepts or single components.
         Nothing is compared for tasks that start in the demonstrations' initial states, where replaying a demonstration is right.
-
-        Args:
-            task: evaluated task.
-            domain: domain of the task.
-            count: number of generated plans.
-            demonstrations: demonstrations of the task's learned concept, if any.
-            root: folder of the user's copy of the data.
-            seed: seed of the fresh samples.
         """
+        task, count, demonstrations = generated.task, len(generated.states), generated.demonstrations
         if task.initial != "new":
             return cls(task, domain, count)
         novel = task.learned == (task.goal,) and demonstrations is not None and len(demonstrations) > 0
@@ -245,8 +230,7 @@ def real_behaviour(judged: Sequence[TaskResult], domain: Domain, root: Path | No
     behaviour = []
     with bar(f"fresh samples of {len(judged)} tasks", len(judged), lines=False) as advance:
         for generated in judged:
-            count, demonstrations = len(generated.states), generated.demonstrations
-            behaviour.append(Real.of(generated.task, domain, count, demonstrations, root, seed))
+            behaviour.append(Real.of(generated, domain, root, seed))
             advance()
     return behaviour
 

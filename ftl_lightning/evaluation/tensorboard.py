@@ -4,7 +4,7 @@ While fitting, a setting's mean is a point of a curve. In a test the means go to
 table. The HPARAMS tab reads the means from charts with a single point, which come after all curves and pictures.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -54,12 +54,12 @@ def draw(logger: TensorBoardLogger, judged: Sequence[TaskResult], domain: Domain
     for behaviour in judged:
         name = f"{behaviour.task.setting}/{behaviour.task.name}"
         logger.experiment.add_figure(f"{PICTURES}/{name}", picture(behaviour, domain, figures), step)
-        if domain.show.film is not None:
-            log_animation(logger, f"{FILMS}/{name}", domain.show.film(behaviour.states[0]), step, title(behaviour))
-        film = domain.closed_loop.film if domain.closed_loop else None
-        if film and behaviour.rollout is not None and behaviour.followed is not None:
-            frames = film(behaviour.rollout.take(0, 1), behaviour.followed)
-            log_animation(logger, f"{ROLLOUTS}/{name}", frames, step, behaviour.task.goal, outcome_text(behaviour.outcomes))
+        if (film := domain.show.film) is not None:
+            log_animation(logger, f"{FILMS}/{name}", captioned(film(behaviour.states[0]), title(behaviour)), step)
+        if domain.closed_loop and domain.closed_loop.film and behaviour.rollout is not None and behaviour.followed is not None:
+            frames = domain.closed_loop.film(behaviour.rollout.take(0, 1), behaviour.followed)
+            ended = captioned(frames, behaviour.task.goal, outcome_text(behaviour.outcomes))
+            log_animation(logger, f"{ROLLOUTS}/{name}", ended, step)
 
 
 def title(behaviour: TaskResult) -> str:
@@ -92,34 +92,22 @@ def picture(behaviour: TaskResult, domain: Domain, figures: int) -> "Figure":
     )
 
 
-def log_animation(
-    logger: TensorBoardLogger, tag: str, pictures: Sequence[NDArray[np.uint8]], step: int, caption: str = "", ending: str = ""
-) -> None:
-    """Log an animated GIF as an image.
-
-    Args:
-        logger: output.
-        tag: name of the image.
-        pictures: ``(height, width, 3)`` each.
-        step: global step.
-        caption, ending: text below every picture and below the last, see :func:`~ftl_lightning.evaluation.pictures.captioned`.
-    """
-    frames = captioned(pictures, caption, ending)
+def log_animation(logger: TensorBoardLogger, tag: str, frames: Sequence[NDArray[np.uint8]], step: int) -> None:
+    """Log frames ``(height, width, 3)`` as an animated image."""
     height, width, _ = frames[0].shape
     image = Summary.Image(encoded_image_string=gif(frames), height=height, width=width, colorspace=3)
     logger.experiment.file_writer.add_summary(Summary(value=[Summary.Value(tag=tag, image=image)]), step)
 
 
-def setting_means(values: Mapping[tuple[str, str], Mapping[str, float]]) -> dict[str, float]:
+def setting_means(values: Iterable[tuple[str, str, float]]) -> dict[str, float]:
     """Mean over tasks of every metric and setting, such as ``'accuracy/new concept'``; names are the same in every domain.
 
     Args:
-        values: values by metric, by setting and task.
+        values: setting, metric and value of each task.
     """
     by_name: dict[str, list[float]] = {}
-    for (setting, _), by_metric in values.items():
-        for metric, value in by_metric.items():
-            by_name.setdefault(f"{metric}/{setting}", []).append(value)
+    for setting, metric, value in values:
+        by_name.setdefault(f"{metric}/{setting}", []).append(value)
     return {name: sum(task_values) / len(task_values) for name, task_values in by_name.items()}
 
 
@@ -143,11 +131,9 @@ def log_test(logger: TensorBoardLogger, settings: Mapping[str, Any], rows: Seque
         step: global step.
     """
     measured = own_rows(rows)
-    values: dict[tuple[str, str], dict[str, float]] = {}
-    for row in measured:
-        values.setdefault((row.setting, row.task), {})[row.metric] = row.value
+    means = setting_means((row.setting, row.metric, row.value) for row in measured)
+    log_hparams(logger, settings, {f"{RESULTS}/{name}": value for name, value in means.items()}, step)
     tasks = list(dict.fromkeys(row.task for row in measured))
-    log_hparams(logger, settings, {f"{RESULTS}/{name}": value for name, value in setting_means(values).items()}, step)
     logger.experiment.add_text(f"{RESULTS}/settings", plain(summary_table(rows)), step)
     logger.experiment.add_text(f"{RESULTS}/tasks", plain(summary_table(rows, tasks)), step)
 
