@@ -23,9 +23,8 @@ from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.domains.comparison import OURS, PAPERS_METHOD, WITH_MODES, Compared
 from ftl_lightning.domains.domain import COVERAGE, NOVELTY, Domain
 from ftl_lightning.domains.registry import load_domain
-from ftl_lightning.evaluation.diversity import Real, lines, real_behaviour
-from ftl_lightning.evaluation.generation import Generation, generate
-from ftl_lightning.evaluation.judged import TaskResult
+from ftl_lightning.evaluation.generation import Generation, TaskResult, generate
+from ftl_lightning.evaluation.references import Real, lines, real_behaviour
 from ftl_lightning.igm.inversion import invert
 from ftl_lightning.igm.settings import GROUPS, InversionSettings
 from ftl_lightning.reporting.frontier import NOISY, read_frontier, write_frontier
@@ -144,7 +143,7 @@ def measure(domain: Domain, suite: str, form: Form, seed: int, samples: int, out
     for temperature in missing:
         generation = Generation(samples, temperature=temperature or 0.0, seed=seed, **sampling)
         judged = generate(module, tasks, generation)
-        real = real_behaviour(judged, domain, module.demonstrated, seed=seed)
+        real = real_behaviour(judged, domain, seed=seed)
         compared = [behaviour.added(one) for behaviour, one in zip(real, judged, strict=True)]
         ours = [row(one, domain, {**run, **method, "temperature": temperature}) for one in compared]
         reference = {"form": "", "variant": "", "temperature": None}

@@ -15,7 +15,7 @@ import torch
 from ftl_lightning.domains.mocap.measures import is_stride
 from ftl_lightning.domains.mocap.rendering import film
 from ftl_lightning.domains.mocap.skeleton import L_ANKLE, POSE, R_ANKLE, as_joints, standing_poses, walking_poses
-from ftl_lightning.evaluation.animation import gif, side_by_side
+from ftl_lightning.evaluation.pictures import gif, side_by_side
 from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.services.tensor_file import atomic
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from ftl_lightning.apps.benchmark.strokes import drawn
-from ftl_lightning.evaluation.animation import gif
+from ftl_lightning.evaluation.pictures import gif
 from ftl_lightning.services.tensor_file import atomic
 
 sys.path.insert(0, str(Path(__file__).parents[2]))  # the browser is that of the tests

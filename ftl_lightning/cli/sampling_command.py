@@ -79,7 +79,7 @@ def sample(options: SampleOptions) -> None:
     """Generate behaviour; write, judge, draw and execute it."""
     from dataclasses import replace
 
-    from ftl_lightning.evaluation.animation import captioned, gif
+    from ftl_lightning.evaluation.pictures import captioned, gif
     from ftl_lightning.few_shot.learner import FewShot
     from ftl_lightning.services.tensor_file import atomic, write_text
 

@@ -30,7 +30,7 @@ ACCURACY = "accuracy"
 SUCCESS = "success"
 NOVELTY, COVERAGE = "novelty", "coverage"
 """Distances of generated plans to demonstrations, and of fresh behaviour to generated plans, see
-:mod:`ftl_lightning.evaluation.diversity`. They are measured in every domain; a domain's metric of this name takes precedence."""
+:mod:`ftl_lightning.evaluation.references`. They are measured in every domain; a domain's metric of this name takes precedence."""
 CLOSED = "closed loop"
 EXECUTED = f"{CLOSED} {SUCCESS}"
 Split = Literal["train", "validation"]

@@ -5,7 +5,7 @@ from typing import Any
 
 import lightning.pytorch as pl
 
-from ftl_lightning.evaluation.evaluable import Evaluable
+from ftl_lightning.evaluation.generation import Evaluable
 from ftl_lightning.evaluation.row import Row
 from ftl_lightning.evaluation.rows import public
 from ftl_lightning.services.errors import short

@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, closing
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from ftl_lightning.data.features import InitialStates, Observed, moved, take
 from ftl_lightning.domains.execution import ClosedLoop, Policy, Rollout
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.samplers import Sampling
-from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.errors import UserError, about, require
 from ftl_lightning.services.progress import Advance, bar
 from ftl_lightning.training.concept_model import ConceptModel
 
@@ -32,6 +33,9 @@ SIDE_BY_SIDE = 64
 def roll_out(loop: ClosedLoop, starts: InitialStates, policy: Policy) -> Rollout:
     """Run an episode from each scene until its environment ends it, :data:`SIDE_BY_SIDE` at a time.
 
+    Gymnasium's ``SyncVectorEnv`` cannot do this: it resets all environments with the same options, an error of one environment ends
+    all episodes, and without autoreset it fails at the first step after an episode has ended (version 1.4).
+
     Args:
         loop: the domain's environment.
         starts: initial states with scenes.
@@ -41,14 +45,16 @@ def roll_out(loop: ClosedLoop, starts: InitialStates, policy: Policy) -> Rollout
         UserError: naming the episode, for a scene that cannot be built.
         MemoryError, OSError: from an environment; any other error only fails its episode.
     """
-    count, kept = len(starts), loop.keeps or tuple(starts.observed)
+    count = len(starts)
     observed = {
-        name: starts.observed[name][:, None].repeat(1, loop.steps + 1, *(1,) * (starts.observed[name].dim() - 1)) for name in kept
+        name: values[:, None].repeat(1, loop.steps + 1, *(1,) * (values.dim() - 1))
+        for name, values in starts.observed.items()
+        if name in loop.keeps or not loop.keeps
     }
     rollout = Rollout(starts, observed, torch.zeros(count, dtype=torch.bool), [{} for _ in range(count)])
     with bar(f"{count} episodes", loop.steps * count, lines=False) as advance:
-        for rows in torch.arange(count).split(SIDE_BY_SIDE):
-            _lock_step(loop, rows.tolist(), rollout, policy, advance)
+        for first in range(0, count, SIDE_BY_SIDE):
+            _lock_step(loop, range(first, min(first + SIDE_BY_SIDE, count)), rollout, policy, advance)
     return rollout
 
 
@@ -58,85 +64,77 @@ def reset(loop: ClosedLoop, scenes: Tensor) -> InitialStates:
     Raises:
         UserError: naming the episode, for a scene that cannot be built.
     """
-    environment = loop.environment()
-    try:
-        seen = [_reset(environment, row, scene) for row, scene in enumerate(scenes)]
-    finally:
-        environment.close()
-    return InitialStates({name: torch.stack([torch.as_tensor(first[name]) for first in seen]) for name in seen[0]}, scenes)
+    with closing(loop.environment()) as environment:
+        observed = [_reset(environment, row, scene) for row, scene in enumerate(scenes)]
+    return InitialStates({name: torch.stack([torch.as_tensor(first[name]) for first in observed]) for name in observed[0]}, scenes)
 
 
 def _reset(environment: "gymnasium.Env[Any, Any]", row: int, scene: Tensor) -> Any:
     """Reset to a scene and return the observation."""
-    try:
+    with about(f"episode {row}"):
         return environment.reset(options={"scene": scene.numpy()})[0]
-    except UserError as error:
-        raise UserError(f"episode {row}: {error}") from error
 
 
-def _lock_step(loop: ClosedLoop, rows: list[int], rollout: Rollout, policy: Policy, advance: Advance) -> None:
-    """Run episodes in lockstep and fill in the rollout."""
-    environments: dict[int, gymnasium.Env[Any, Any]] = {}
+def _lock_step(loop: ClosedLoop, rows: range, rollout: Rollout, policy: Policy, advance: Advance) -> None:
+    """Run consecutive episodes in lockstep and fill in the rollout."""
     scenes = rollout.starts.require_scenes()
     # Current values of all features; the rollout keeps some of them.
-    now = {name: values[rows].clone() for name, values in rollout.starts.observed.items()}
-    place = {row: index for index, row in enumerate(rows)}
+    current = {name: values[rows.start : rows.stop].clone() for name, values in rollout.starts.observed.items()}
+    environments: dict[int, gymnasium.Env[Any, Any]] = {}
 
-    def fail(row: int, why: str) -> None:
+    def fail(row: int, reason: str) -> None:
         rollout.failed[row] = True
-        _LOG.warning("episode %d, %s; the episode counts as failed", row, why)
+        _LOG.warning("episode %d, %s; the episode counts as failed", row, reason)
 
-    def see(row: int, step: int, seen: Observed) -> None:
-        for name, values in now.items():
-            if not isinstance(seen, Mapping) or name not in seen or tuple(np.shape(seen[name])) != tuple(values.shape[1:]):
-                shape = np.shape(seen[name]) if isinstance(seen, Mapping) and name in seen else "none"
-                raise UserError(f"environment: expected it to observe {name!r} {tuple(values.shape[1:])}, found {shape}")
-            values[place[row]] = torch.as_tensor(seen[name])
+    def observe(row: int, step: int, observation: Any) -> None:
+        for name, values in current.items():
+            value = observation.get(name) if isinstance(observation, Mapping) else None
+            shape, place = tuple(values.shape[1:]), row - rows.start
+            if value is None or np.shape(value) != shape:
+                found = "none" if value is None else np.shape(value)
+                raise UserError(f"environment: expected it to observe {name!r} {shape}, found {found}")
+            values[place] = torch.as_tensor(value)
             if name in rollout.observed:
-                rollout.observed[name][row, step:] = values[place[row]]
+                rollout.observed[name][row, step:] = values[place]
 
-    try:
-        active = []
+    with ExitStack() as stack:
         for row in rows:
-            environments[row] = loop.environment()
+            environment = stack.enter_context(closing(loop.environment()))
             try:
-                seen = _reset(environments[row], row, scenes[row])
+                observation = _reset(environment, row, scenes[row])
             except (UserError, MemoryError, OSError):
                 raise
             except Exception as error:  # any error of a simulator: the other episodes go on
                 fail(row, f"before its first step: {error!r}")
                 advance(loop.steps)
                 continue
-            see(row, 0, seen)
-            active.append(row)
+            observe(row, 0, observation)
+            environments[row] = environment
+        active = list(environments)
         for step in range(loop.steps):
             if not active:
                 break
-            actions = policy(take(now, [place[row] for row in active]), active, step).numpy().astype(np.float32)
-            if len(actions) != len(active):
-                raise UserError(f"planner: expected actions of {len(active)} episodes, found shape {actions.shape}")
-            going = []
+            actions = policy(take(current, [row - rows.start for row in active]), active, step).numpy().astype(np.float32)
+            require(len(actions) == len(active), "planner", f"actions of {len(active)} episodes", f"shape {actions.shape}")
+            continuing = []
             for row, action in zip(active, actions, strict=True):
                 advance()
                 if not np.isfinite(action).all():
                     fail(row, f"step {step}: the plan is not finite")
                     continue
                 try:
-                    seen, _, terminated, truncated, info = environments[row].step(action)
+                    observation, _, terminated, truncated, info = environments[row].step(action)
                 except (MemoryError, OSError):
                     raise
                 except Exception as error:  # as above
                     fail(row, f"step {step}: {error!r}")
                     continue
-                see(row, step + 1, seen)
+                observe(row, step + 1, observation)
                 rollout.infos[row].update(info)
                 if not (terminated or truncated):
-                    going.append(row)
-            advance((len(active) - len(going)) * (loop.steps - step - 1))  # remaining steps of ended episodes
-            active = going
-    finally:
-        for environment in environments.values():
-            environment.close()
+                    continuing.append(row)
+            advance((len(active) - len(continuing)) * (loop.steps - step - 1))  # remaining steps of ended episodes
+            active = continuing
 
 
 class PlanFollower:

@@ -10,18 +10,16 @@ from typing import Any
 import lightning.pytorch as pl
 from lightning.pytorch.loggers import TensorBoardLogger
 
+from ftl_lightning.domains.domain import Domain
+from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.evaluation.chosen import chosen
-from ftl_lightning.evaluation.diversity import lines, real_behaviour
-from ftl_lightning.evaluation.drawing import draw
-from ftl_lightning.evaluation.evaluable import Evaluable, is_evaluable
-from ftl_lightning.evaluation.films import write_films
-from ftl_lightning.evaluation.generation import Generation, execute, generate, tasks_of
-from ftl_lightning.evaluation.judged import TaskResult
+from ftl_lightning.evaluation.generation import Evaluable, Generation, TaskResult, evaluable, execute, generate, tasks_of
+from ftl_lightning.evaluation.pictures import write_films
 from ftl_lightning.evaluation.record import record
-from ftl_lightning.evaluation.references import references
+from ftl_lightning.evaluation.references import lines, real_behaviour, references
 from ftl_lightning.evaluation.rows import config_hash, configuration, rows
-from ftl_lightning.evaluation.tensorboard import log_projector, log_test, own_rows, setting_means
-from ftl_lightning.services.errors import UserError, short
+from ftl_lightning.evaluation.tensorboard import draw, log_projector, log_test, own_rows, setting_means
+from ftl_lightning.services.errors import require, shown
 from ftl_lightning.services.printing import say
 from ftl_lightning.services.ranges import check_count
 from ftl_lightning.training.checkpoint import Random
@@ -42,8 +40,8 @@ class Evaluator(pl.Callback):
         results: file to which rows are added when testing (``test``, ``invert``); ``None`` for ``results.csv`` in the log folder.
         references: measure reference policies when testing. The rows are equal for all methods, so a single run per seed suffices.
             ``None`` for all data except user demonstrations.
-        diversity: measure novelty and coverage when testing, see :mod:`ftl_lightning.evaluation.diversity`; only adds rows.
-        films: JSON file for films of the first :data:`~ftl_lightning.evaluation.films.FILMED` samples or episodes of each task,
+        diversity: measure novelty and coverage when testing, see :mod:`ftl_lightning.evaluation.references`; only adds rows.
+        films: JSON file for films of the first :data:`~ftl_lightning.evaluation.pictures.FILMED` samples or episodes of each task,
             written when testing, for ``report --html``; ``None`` for none.
         variant: label of this run in tables; ``None`` for the method's label.
         **generation: attributes of :class:`~ftl_lightning.evaluation.generation.Generation`, as keys of the same configuration.
@@ -101,20 +99,22 @@ class Evaluator(pl.Callback):
         """Hash of the configuration in the results file."""
         return config_hash(configuration(module, data, self.settings(data), trainer))
 
+    def _tasks(self, module: Evaluable, data: PretrainingData | InversionData) -> list[EvaluationTask]:
+        return tasks_of(module.domain, self._suite_names(data), module.concepts)
+
     def _check(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Validate the settings before training starts."""
-        module = _evaluable(pl_module)
-        total = module.model.max_steps
-        if total is not None and self.generation.steps > total:
-            raise UserError(f"evaluation.steps: expected 1 to {total} (the model's T), found {self.generation.steps}")
+        module = evaluable(pl_module)
+        total, steps = module.model.max_steps, self.generation.steps
+        require(total is None or steps <= total, "evaluation.steps", f"1 to {total} (the model's T)", steps)
         loop = module.domain.closed_loop
         if self.closed_loop and loop is not None:
             loop.expect()
         others = () if loop is None else tuple(loop.others)
-        if unknown := [name for name in self.generation.environments if name not in others]:
-            expected = f"one of {', '.join(others)}" if others else f"none, as {module.domain.name} has no other"
-            raise UserError(f"evaluation.environments: expected {expected}, found {short(unknown[0])!r}")
-        tasks_of(module.domain, self._suite_names(_data(trainer)), module.concepts)
+        expected = f"one of {', '.join(others)}" if others else f"none, as {module.domain.name} has no other"
+        for name in self.generation.environments:
+            require(name in others, "evaluation.environments", expected, shown(name))
+        self._tasks(module, _data(trainer))
 
     on_fit_start = on_validation_start = on_test_start = _check
 
@@ -122,79 +122,61 @@ class Evaluator(pl.Callback):
         """Evaluate while fitting and in ``validate``."""
         if trainer.sanity_checking:
             return
-        module = _evaluable(pl_module)
+        module, data = evaluable(pl_module), _data(trainer)
         means: dict[str, float] = {}
         if trainer.is_global_zero:  # rank 0 evaluates, the other ranks wait
-            self._generate(module, _data(trainer))
-            means = setting_means({(result.task.setting, result.task.name): result.values for result in self.judged})
+            self.judged = generate(module, self._tasks(module, data), self.generation, data.root)
+            means = setting_means((done.task.setting, *measured) for done in self.judged for measured in done.values.items())
         # Synchronise the global generators, from which a domain's evaluation may draw.
         means, random = trainer.strategy.broadcast((means, Random.now(pl_module.device, 0)))
         if not trainer.is_global_zero:
             random.restore(pl_module.device)
         pl_module.log_dict({f"val/{name}": value for name, value in means.items()}, batch_size=1, sync_dist=True)
-        if not trainer.is_global_zero:
-            return
-        for logger in _boards(trainer):
-            self._draw(logger, module, trainer.global_step)
-            if not self._projected:  # training embeddings do not change while fitting
-                self._project(logger, module, trainer.global_step)
+        if trainer.is_global_zero:
+            self._draw(trainer, module, project=not self._projected)  # training embeddings do not change while fitting
 
     def on_test_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Evaluate in ``test`` and at the end of ``invert``."""
-        module, data = _evaluable(pl_module), _data(trainer)
-        self._generate(module, data)
-        if self.closed_loop and module.domain.closed_loop is not None:
+        module, data = evaluable(pl_module), _data(trainer)
+        domain, settings = module.domain, self.settings(data)
+        self.judged = generate(module, self._tasks(module, data), self.generation, data.root)
+        if self.closed_loop and domain.closed_loop is not None:
             self.judged = execute(module, self.judged, self.generation)
-        configured = configuration(module, data, self.settings(data), trainer)
-        line_results = self._compare(module, data) if self.judged else {}
-        measured = rows(module, module.domain, self.judged, line_results, configured, self.variant)
+        reference_lines = self._compare(domain, data) if self.judged else {}
+        configured = configuration(module, data, settings, trainer)
+        measured = rows(module, domain, self.judged, reference_lines, configured, self.variant)
         record(measured, self.results, trainer.log_dir or trainer.default_root_dir)  # before drawing, which may fail
         if self.films and trainer.is_global_zero:
-            count = write_films(self.films, module.domain, self.judged, line_results, measured)
+            count = write_films(self.films, domain, self.judged, reference_lines, measured)
             say(f"{self.films}: {count} films")
-        method_rows = own_rows(measured)
-        for logger in _boards(trainer):
-            self._draw(logger, module, trainer.global_step)
-            self._project(logger, module, trainer.global_step)
-            if method_rows:
-                log_test(logger, chosen(module, data, self.settings(data), trainer, method_rows), measured, trainer.global_step)
+        self._draw(trainer, module)
+        if method_rows := own_rows(measured):
+            hparams = chosen(module, data, settings, trainer, method_rows)
+            for logger in _boards(trainer):
+                log_test(logger, hparams, measured, trainer.global_step)
 
-    def _generate(self, module: Evaluable, data: PretrainingData | InversionData) -> None:
-        tasks = tasks_of(module.domain, self._suite_names(data), module.concepts)
-        self.judged = generate(module, tasks, self.generation, data.root)
-
-    def _compare(self, module: Evaluable, data: PretrainingData | InversionData) -> Mapping[str, Sequence[TaskResult]]:
+    def _compare(self, domain: Domain, data: PretrainingData | InversionData) -> Mapping[str, Sequence[TaskResult]]:
         """Measure novelty and coverage, and return the reference lines by name."""
-        domain, seed = module.domain, self.generation.seed
+        seed, environments = self.generation.seed, self.generation.environments
         compared = self.references if self.references is not None else not getattr(data, "own", False)
-        line_results = references(self.judged, domain, module.demonstrated, seed, self.generation.environments) if compared else {}
+        reference_lines = references(self.judged, domain, seed, environments) if compared else {}
         if self.diversity:
-            real = real_behaviour(self.judged, domain, module.demonstrated, data.root, seed)
+            real = real_behaviour(self.judged, domain, data.root, seed)
             self.judged = [known.added(generated) for known, generated in zip(real, self.judged, strict=True)]
-            line_results |= lines(real) if compared else {}
-        return line_results
+            reference_lines |= lines(real) if compared else {}
+        return reference_lines
 
-    def _draw(self, logger: TensorBoardLogger, module: Evaluable, step: int) -> None:
-        try:
-            if self.figures:
-                draw(logger, self.judged, module.domain, module.demonstrated, self.figures, step)
-        except Exception as error:  # any error of a domain's pictures: results are already saved
-            _LOG.warning("domain %s: its pictures cannot be drawn: %r", module.domain.name, error)
-
-    def _project(self, logger: TensorBoardLogger, module: Evaluable, step: int) -> None:
-        log_projector(logger, module.concept_points(), step)
-        self._projected = True
-
-
-def _evaluable(module: pl.LightningModule) -> Evaluable:
-    """Check that a module can be evaluated.
-
-    Raises:
-        UserError: for a module that generates no behaviour.
-    """
-    if not is_evaluable(module):
-        raise UserError(f"model.class_path: expected a module that generates behaviour, found {type(module).__name__}")
-    return module
+    def _draw(self, trainer: pl.Trainer, module: Evaluable, project: bool = True) -> None:
+        """Log pictures and concept embeddings to TensorBoard."""
+        for logger in _boards(trainer):
+            try:
+                if self.figures:
+                    draw(logger, self.judged, module.domain, self.figures, trainer.global_step)
+            except Exception as error:  # any error of a domain's pictures: results are already saved
+                _LOG.warning("domain %s: its pictures cannot be drawn: %r", module.domain.name, error)
+            if project:
+                log_projector(logger, module.concept_points(), trainer.global_step)
+                self._projected = True
 
 
 def _data(trainer: pl.Trainer) -> PretrainingData | InversionData:

@@ -12,11 +12,11 @@ from torch import Tensor
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.domain import Domain, closed_loop_of
 from ftl_lightning.domains.execution import ClosedLoop, Rollout
-from ftl_lightning.evaluation.animation import captioned, gif, outcome_text
 from ftl_lightning.evaluation.closed_loop import PlanFollower, planner, roll_out, sampled_plans
+from ftl_lightning.evaluation.pictures import captioned, gif, outcome_text
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.samplers import Sampling
-from ftl_lightning.services.errors import UserError, shown
+from ftl_lightning.services.errors import UserError, require
 from ftl_lightning.services.representation import Shown, counted
 from ftl_lightning.services.seeding import generator
 from ftl_lightning.services.tensor_file import atomic
@@ -76,13 +76,13 @@ class Execution(Shown):
         for name, value in self.outcomes.items():
             yield f"{name} {value:.2f}"
 
+    def _judged(self) -> dict[str, Tensor]:
+        return self.domain.judge(self.goal, self.rollout) if self.goal else {}
+
     @property
     def outcomes(self) -> dict[str, float]:
         """Share of episodes (boolean outcomes) or mean (numeric outcomes) by name; empty without a goal."""
-        if not self.goal:
-            return {}
-        judged = self.domain.judge(self.goal, self.rollout)
-        return {name: float(values.float().mean()) for name, values in judged.items()}
+        return {name: float(values.float().mean()) for name, values in self._judged().items()}
 
     def frames(self, episode: int = 0) -> list[NDArray[np.uint8]]:
         """Render the frames ``(height, width, 3)`` of an episode.
@@ -93,12 +93,11 @@ class Execution(Shown):
         Raises:
             UserError: for an episode that did not begin, or a domain without films of episodes.
         """
-        plans = self.followed.get(episode) if isinstance(episode, int) else None
-        if not plans:
-            raise UserError(f"episode: expected one of {len(self.rollout.failed)} that began, found {shown(episode)}")
+        began = isinstance(episode, int) and self.followed.get(episode)
+        require(began, "episode", f"one of {len(self.rollout.failed)} that began", episode)
         if (film := closed_loop_of(self.domain).film) is None:
             raise UserError(f"film: expected a domain that films episodes, found {self.domain.name}")
-        return film(self.rollout.take(episode, episode + 1), torch.stack(list(plans)))
+        return film(self.rollout.take(episode, episode + 1), torch.stack(list(self.followed[episode])))
 
     def save(self, path: str | Path, episode: int = 0) -> None:
         """Save an episode as an animated .gif.
@@ -110,9 +109,8 @@ class Execution(Shown):
         Raises:
             UserError: for another suffix, an episode that did not begin, or a domain without films of episodes.
         """
-        if Path(path).suffix != ".gif":
-            raise UserError(f"{path}: expected a name that ends in .gif, found {Path(path).suffix or 'no ending'}")
-        outcomes = self.domain.judge(self.goal, self.rollout) if self.goal else {}
-        pictures = captioned(self.frames(episode), self.goal, outcome_text(outcomes, episode))
+        suffix = Path(path).suffix
+        require(suffix == ".gif", str(path), "a name that ends in .gif", suffix or "no ending")
+        pictures = captioned(self.frames(episode), self.goal, outcome_text(self._judged(), episode))
         with atomic(path) as temporary:
             temporary.write_bytes(gif(pictures))

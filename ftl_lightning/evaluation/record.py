@@ -3,8 +3,9 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+from ftl_lightning.evaluation.generation import OWN
 from ftl_lightning.evaluation.row import Row
-from ftl_lightning.evaluation.summary import OWN, show, summary_table
+from ftl_lightning.evaluation.summary import show, summary_table
 from ftl_lightning.services.printing import say
 
 

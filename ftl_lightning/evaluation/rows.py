@@ -7,8 +7,7 @@ from typing import Any
 import lightning.pytorch as pl
 
 from ftl_lightning.domains.domain import Domain
-from ftl_lightning.evaluation.evaluable import Evaluable, demonstrations_of
-from ftl_lightning.evaluation.judged import TaskResult, paired, share
+from ftl_lightning.evaluation.generation import Evaluable, TaskResult, demonstrations_of, paired, share
 from ftl_lightning.evaluation.row import METHOD, REFERENCE, Row
 from ftl_lightning.services.tensor_file import content_hash, file_hash
 from ftl_lightning.version import __version__

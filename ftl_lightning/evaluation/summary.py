@@ -10,14 +10,12 @@ from rich.table import Table
 from rich.text import Text
 
 from ftl_lightning.domains.domain import COVERAGE, NOVELTY
-from ftl_lightning.evaluation.judged import LOST, WON, standard_error
+from ftl_lightning.evaluation.generation import LOST, OWN, WON, standard_error
 from ftl_lightning.evaluation.row import METHOD, REFERENCE, Row, label
 from ftl_lightning.services.escape import markdown
 from ftl_lightning.services.printing import line, say
 
 DIVERSITY = (NOVELTY, COVERAGE)
-OWN = "own demonstrations"
-"""Setting of learned concepts outside all suites."""
 
 
 def summary_table(rows: Sequence[Row], single: Sequence[str] = ()) -> Table:

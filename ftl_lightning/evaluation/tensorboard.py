@@ -1,13 +1,13 @@
-"""TensorBoard output besides curves and figures: HPARAMS tab, tables, animations, projector.
+"""TensorBoard output of an evaluation besides curves: figures, animations, tables, HPARAMS tab, projector.
 
 While fitting, a setting's mean is a point of a curve. In a test the means go to the HPARAMS tab and the values per task into a
 table. The HPARAMS tab reads the means from charts with a single point, which come after all curves and pictures.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -18,13 +18,19 @@ from tensorboard.compat.proto.summary_pb2 import Summary
 from torch.utils.tensorboard.summary import hparams, scalar
 from torch.utils.tensorboard.writer import FileWriter
 
-from ftl_lightning.evaluation.animation import captioned, gif
-from ftl_lightning.evaluation.judged import LOST, WON
+from ftl_lightning.domains.domain import Domain
+from ftl_lightning.domains.pictures import Drawn, beside
+from ftl_lightning.evaluation.generation import LOST, WON, TaskResult, share
+from ftl_lightning.evaluation.pictures import captioned, gif, outcome_text
 from ftl_lightning.evaluation.row import METHOD, Row
 from ftl_lightning.evaluation.summary import plain, summary_table
 from ftl_lightning.igm.point import Part, Point
 from ftl_lightning.services.printing import line
-from ftl_lightning.training.board import RESULTS
+from ftl_lightning.training.board import FILMS, PICTURES, RESULTS, ROLLOUTS
+from ftl_lightning.training.quality import first_windows
+
+if TYPE_CHECKING:  # slow import
+    from matplotlib.figure import Figure
 
 HPARAMS = ".hparams"
 """Suffix of the event file for the HPARAMS tab. The file is separate so that a later test can replace it: TensorBoard shows only
@@ -35,16 +41,73 @@ WITHOUT = "-"
 """Placeholder for a point without a component."""
 
 
-def setting_means(values: Mapping[tuple[str, str], Mapping[str, float]]) -> dict[str, float]:
+def draw(logger: TensorBoardLogger, judged: Sequence[TaskResult], domain: Domain, figures: int, step: int) -> None:
+    """Log a figure of each task's plans and films of the first plan and the first episode.
+
+    Args:
+        logger: output.
+        judged: generated behaviour.
+        domain: domain that draws.
+        figures: number of samples in a figure, 1 or more, and maximum number of demonstrations.
+        step: global step.
+    """
+    for behaviour in judged:
+        name = f"{behaviour.task.setting}/{behaviour.task.name}"
+        logger.experiment.add_figure(f"{PICTURES}/{name}", picture(behaviour, domain, figures), step)
+        if (film := domain.show.film) is not None:
+            log_animation(logger, f"{FILMS}/{name}", captioned(film(behaviour.states[0]), title(behaviour)), step)
+        if domain.closed_loop and domain.closed_loop.film and behaviour.rollout is not None and behaviour.followed is not None:
+            frames = domain.closed_loop.film(behaviour.rollout.take(0, 1), behaviour.followed)
+            ended = captioned(frames, behaviour.task.goal, outcome_text(behaviour.outcomes))
+            log_animation(logger, f"{ROLLOUTS}/{name}", ended, step)
+
+
+def title(behaviour: TaskResult) -> str:
+    """Name of the task and share of right plans, if judged."""
+    return behaviour.task.name if behaviour.right is None else f"{behaviour.task.name}: {share(behaviour.right):.2f} right"
+
+
+def picture(behaviour: TaskResult, domain: Domain, figures: int) -> "Figure":
+    """Draw plans, framed green if right and red if wrong, below the demonstrations.
+
+    Args:
+        behaviour: behaviour of a task.
+        domain: domain that draws.
+        figures: number of plans, and maximum number of demonstrations.
+    """
+    shown = slice(0, figures)
+    starts = None if behaviour.starts is None else behaviour.starts.take(shown)
+    right = None if behaviour.right is None else behaviour.right[shown].tolist()
+    states, demonstrations = behaviour.states[shown], behaviour.demonstrations
+    if demonstrations is None:
+        return domain.show.picture(states, right, title(behaviour), starts)
+    windows, first = first_windows(demonstrations, states.shape[1])
+    above = f"demonstrations: {', '.join(behaviour.task.learned)}"
+    below = "samples" if right is None else f"samples: {sum(right)} right (green), {right.count(False)} wrong (red)"
+    return beside(
+        domain.show,
+        Drawn(above, windows[shown], first.take(shown) if domain.observed else None),
+        Drawn(below, states, starts, right),
+        title(behaviour),
+    )
+
+
+def log_animation(logger: TensorBoardLogger, tag: str, frames: Sequence[NDArray[np.uint8]], step: int) -> None:
+    """Log frames ``(height, width, 3)`` as an animated image."""
+    height, width, _ = frames[0].shape
+    image = Summary.Image(encoded_image_string=gif(frames), height=height, width=width, colorspace=3)
+    logger.experiment.file_writer.add_summary(Summary(value=[Summary.Value(tag=tag, image=image)]), step)
+
+
+def setting_means(values: Iterable[tuple[str, str, float]]) -> dict[str, float]:
     """Mean over tasks of every metric and setting, such as ``'accuracy/new concept'``; names are the same in every domain.
 
     Args:
-        values: values by metric, by setting and task.
+        values: setting, metric and value of each task.
     """
     by_name: dict[str, list[float]] = {}
-    for (setting, _), by_metric in values.items():
-        for metric, value in by_metric.items():
-            by_name.setdefault(f"{metric}/{setting}", []).append(value)
+    for setting, metric, value in values:
+        by_name.setdefault(f"{metric}/{setting}", []).append(value)
     return {name: sum(task_values) / len(task_values) for name, task_values in by_name.items()}
 
 
@@ -68,11 +131,9 @@ def log_test(logger: TensorBoardLogger, settings: Mapping[str, Any], rows: Seque
         step: global step.
     """
     measured = own_rows(rows)
-    values: dict[tuple[str, str], dict[str, float]] = {}
-    for row in measured:
-        values.setdefault((row.setting, row.task), {})[row.metric] = row.value
+    means = setting_means((row.setting, row.metric, row.value) for row in measured)
+    log_hparams(logger, settings, {f"{RESULTS}/{name}": value for name, value in means.items()}, step)
     tasks = list(dict.fromkeys(row.task for row in measured))
-    log_hparams(logger, settings, {f"{RESULTS}/{name}": value for name, value in setting_means(values).items()}, step)
     logger.experiment.add_text(f"{RESULTS}/settings", plain(summary_table(rows)), step)
     logger.experiment.add_text(f"{RESULTS}/tasks", plain(summary_table(rows, tasks)), step)
 
@@ -110,29 +171,11 @@ def log_projector(logger: TensorBoardLogger, points: Sequence[Point], step: int)
         points: points of the same concept space.
         step: global step.
     """
+
+    def labels(part: Part | None) -> tuple[str, str]:
+        return (WITHOUT, WITHOUT) if part is None else (str(part.component), part.name)
+
     if points:
-        stacked = torch.stack([point.embedding.cpu() for point in points])
-        table = [[line(point.text), point.set, *_numbered(point.part)] for point in points]
-        logger.experiment.add_embedding(stacked, metadata=table, metadata_header=list(COLUMNS), global_step=step, tag="concepts")
-
-
-def _numbered(part: Part | None) -> tuple[str, str]:
-    return (WITHOUT, WITHOUT) if part is None else (str(part.component), part.name)
-
-
-def log_animation(
-    logger: TensorBoardLogger, tag: str, pictures: Sequence[NDArray[np.uint8]], step: int, caption: str = "", ending: str = ""
-) -> None:
-    """Log an animated GIF as an image.
-
-    Args:
-        logger: output.
-        tag: name of the image.
-        pictures: ``(height, width, 3)`` each.
-        step: global step.
-        caption, ending: text below every picture and below the last, see :func:`~ftl_lightning.evaluation.animation.captioned`.
-    """
-    shown = captioned(pictures, caption, ending)
-    height, width, _ = shown[0].shape
-    image = Summary.Image(encoded_image_string=gif(shown), height=height, width=width, colorspace=3)
-    logger.experiment.file_writer.add_summary(Summary(value=[Summary.Value(tag=tag, image=image)]), step)
+        embeddings = torch.stack([point.embedding.cpu() for point in points])
+        table = [[line(point.text), point.set, *labels(point.part)] for point in points]
+        logger.experiment.add_embedding(embeddings, metadata=table, metadata_header=list(COLUMNS), global_step=step, tag="concepts")

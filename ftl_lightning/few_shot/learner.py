@@ -49,8 +49,8 @@ from ftl_lightning.services.trust import vouching
 from ftl_lightning.training.checks import Check, check_concept, check_sizes, check_with, notes_of
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.hub import CONCEPT_FILES, download, is_repository, save_with_card, upload
-from ftl_lightning.training.judging import judged, judging_domain, picture
 from ftl_lightning.training.model_folder import load_model
+from ftl_lightning.training.quality import judged, judging_domain, picture
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

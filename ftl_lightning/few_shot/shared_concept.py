@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import InitialStates, moved
 from ftl_lightning.domains.domain import Domain
-from ftl_lightning.evaluation.animation import captioned, gif
 from ftl_lightning.evaluation.execution import episodes
+from ftl_lightning.evaluation.pictures import captioned, gif
 from ftl_lightning.few_shot.tuned import ModelSettings
 from ftl_lightning.igm.composition import Composition, space_of
 from ftl_lightning.igm.concept import Concept

@@ -10,7 +10,7 @@ from matplotlib.lines import Line2D
 
 from ftl_lightning.domains.comparison import CHOSEN, OURS, Compared
 from ftl_lightning.domains.domain import Domain
-from ftl_lightning.evaluation.diversity import FRESH, REPLAYED
+from ftl_lightning.evaluation.references import FRESH, REPLAYED
 from ftl_lightning.evaluation.results import latest
 from ftl_lightning.evaluation.row import REFERENCE
 from ftl_lightning.evaluation.row import label as method_label

@@ -11,7 +11,7 @@ from ftl_lightning.domains.domain import CLOSED, COVERAGE, EXECUTED, NOVELTY, Co
 from ftl_lightning.domains.from_file import OWN
 from ftl_lightning.domains.registry import domain_of_file, is_known
 from ftl_lightning.domains.tasks import EvaluationTask
-from ftl_lightning.evaluation.judged import LOST, WON
+from ftl_lightning.evaluation.generation import LOST, WON
 from ftl_lightning.services.errors import UserError, shown
 from ftl_lightning.services.printing import say
 

@@ -8,7 +8,7 @@ import pandas as pd
 
 from ftl_lightning.domains.comparison import Compared, Published
 from ftl_lightning.domains.domain import Domain
-from ftl_lightning.evaluation.judged import standard_error
+from ftl_lightning.evaluation.generation import standard_error
 from ftl_lightning.reporting.shown import published
 from ftl_lightning.services.escape import latex, latex_row, markdown
 

@@ -1,17 +1,20 @@
-"""Inspection of a learned concept: samples beside demonstrations."""
+"""Judgement of plans by a domain's metrics, and inspection of a learned concept: samples beside demonstrations."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from ftl_lightning.data.demonstrations import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.domain import Domain
+from ftl_lightning.domains.from_file import own_domain
 from ftl_lightning.domains.pictures import Drawn, beside
 from ftl_lightning.igm.concept import Concept, QualityRecord
 from ftl_lightning.igm.forms.quality import Quality, encoded, first_windows, generated, observed_from
+from ftl_lightning.services.errors import require
 from ftl_lightning.training.concept_model import ConceptModel
 
 if TYPE_CHECKING:
@@ -19,6 +22,52 @@ if TYPE_CHECKING:
 
 SHOWN = 16
 """Number of samples in a figure."""
+
+
+def right_plans(measured: Mapping[str, Tensor]) -> tuple[str, Tensor] | None:
+    """Which plans are right: the first boolean metric per plan.
+
+    Args:
+        measured: values of a domain's metrics by name, see :meth:`~ftl_lightning.domains.domain.Domain.measure`.
+
+    Returns:
+        Name and values ``(sample,)`` of the metric; ``None`` without such a metric.
+    """
+    return next(((name, values) for name, values in measured.items() if values.dtype == torch.bool and values.dim()), None)
+
+
+def judging_domain(model: ConceptModel, examples: Sequence[Demonstrations]) -> Domain:
+    """A model's domain; for a user's data, including demonstrations of learned concepts."""
+    if model.examples is None:
+        return model.domain
+    config = model.config
+    return own_domain(concatenate(examples), config.training_concepts, config.horizon, config.metrics)
+
+
+def judged(domain: Domain, plans: Demonstrations, goal: str) -> dict[str, float]:
+    """Evaluate plans by the domain's metrics: success rates or means by name.
+
+    Raises:
+        UserError: for a goal that the domain cannot judge, or a domain without metrics.
+    """
+    require(domain.metrics, "evaluate", "a domain that judges plans", f"{domain.name}; execute them")
+    domain.check_goal(goal)
+    measured = domain.measure(goal, plans.states, plans.initial_states)
+    return {name: float(values.float().mean()) for name, values in measured.items()}
+
+
+def picture(domain: Domain, plans: Demonstrations, goal: str = "") -> "Figure":
+    """Draw plans; with a goal, right plans are framed green and wrong plans red.
+
+    Raises:
+        UserError: for a goal that the domain cannot judge.
+    """
+    starts, right = plans.initial_states, None
+    if goal:
+        domain.check_goal(goal)
+        right = right_plans(domain.measure(goal, plans.states, starts))
+    framed = None if right is None else right[1].tolist()
+    return domain.show.picture(plans.states, framed, goal or "samples", starts if domain.observed else None)
 
 
 @dataclass(frozen=True)
@@ -74,11 +123,12 @@ def inspected(model: ConceptModel, domain: Domain, demonstrations: Demonstration
         seed: seed of the samples.
     """
     name = concept.origin.name
-    every, starts = generated(model, demonstrations, {name: concept}, seed)
-    plans, (known, first) = every[name], first_windows(demonstrations, model.config.horizon)
+    samples, starts = generated(model, demonstrations, {name: concept}, seed)
+    plans, (known, first) = samples[name], first_windows(demonstrations, model.config.horizon)
     right = None
-    if domain.metrics and domain.concepts.reads(name):
-        measured = domain.measure(name, plans, starts if domain.observed else None)
-        right = next(((key, float(values.float().mean())) for key, values in measured.items() if values.dtype == torch.bool), None)
-    quality = Quality.of(encoded(model, plans, starts), encoded(model, known, first), observed_from(demonstrations))
-    return Inspection(quality, right, known, plans, starts, domain, name)
+    if domain.concepts.reads(name):
+        right = right_plans(domain.measure(name, plans, starts if domain.observed else None))
+    observed = observed_from(demonstrations)
+    quality = Quality.of(encoded(model, plans, starts), encoded(model, known, first), observed)
+    success = None if right is None else (right[0], float(right[1].float().mean()))
+    return Inspection(quality, success, known, plans, starts, domain, name)

@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from ftl_lightning.apps.benchmark.strokes import NEW, TRAINING
 
-from ftl_lightning.apps.benchmark.strokes import strokes
+from ftl_lightning.apps.benchmark.strokes import NEW, TRAINING, strokes
 from ftl_lightning.data.check import check, mended, read_mended
 from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.domains.registry import load_domain

@@ -16,7 +16,7 @@ from ftl_lightning.domains.execution import ClosedLoop, Rollout
 from ftl_lightning.domains.object_rearrangement import DOMAIN
 from ftl_lightning.domains.registry import domain_names, load_domain
 from ftl_lightning.domains.tasks import EvaluationTask, Suite, few_shot_suites
-from ftl_lightning.evaluation.judged import TaskResult
+from ftl_lightning.evaluation.generation import TaskResult
 from ftl_lightning.evaluation.references import references
 from ftl_lightning.services.errors import UserError
 
@@ -50,7 +50,7 @@ def test_metrics_judges_and_reference_lines_of_another_shape_are_refused() -> No
     )
     one = TaskResult.of(EvaluationTask("s", GOAL), STATES, None, domain)
     with pytest.raises(UserError, match=r"reference 'mine': expected plans \(5, 1, 21\), found \(5, 2, 21\)"):
-        references([one], domain, lambda concept: None, 0)
+        references([one], domain, 0)
 
 
 def test_a_misspelt_goal_is_told_with_goals_that_are_near() -> None:

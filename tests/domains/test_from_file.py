@@ -14,7 +14,7 @@ from ftl_lightning.data.distances import warped_distances
 from ftl_lightning.data.features import Feature
 from ftl_lightning.domains.from_file import METRICS, domain_from_file, own_domain, read_own
 from ftl_lightning.evaluation.evaluator import Evaluator
-from ftl_lightning.evaluation.judged import TaskResult
+from ftl_lightning.evaluation.generation import TaskResult
 from ftl_lightning.evaluation.results import read_rows
 from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.igm.settings import BudgetOptions

@@ -13,7 +13,7 @@ from ftl_lightning.domains.mocap import skeleton
 from ftl_lightning.domains.mocap.rendering import LEFT, MAX_SAMPLES, RIGHT, SOLE, TRUNK, film, picture, wireframe
 from ftl_lightning.domains.mocap.skeleton import HORIZON
 from ftl_lightning.domains.mocap.source import read_folder
-from ftl_lightning.evaluation.animation import gif, side_by_side
+from ftl_lightning.evaluation.pictures import gif, side_by_side
 from tests.domains.mocap_samples import folder
 
 STANDING = (

@@ -35,7 +35,7 @@ from ftl_lightning.domains.tabletop.source import Episode
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.evaluation import generation
 from ftl_lightning.evaluation.closed_loop import fixed_plans, reset, roll_out
-from ftl_lightning.evaluation.judged import TaskResult
+from ftl_lightning.evaluation.generation import TaskResult
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.training.data import InversionData, PretrainingData
 from tests.conftest import refused

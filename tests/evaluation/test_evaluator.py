@@ -21,14 +21,21 @@ from ftl_lightning.domains.comparison import Comparison
 from ftl_lightning.domains.domain import Domain, Metric
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.domains.tasks import EvaluationTask
-from ftl_lightning.evaluation.drawing import picture
-from ftl_lightning.evaluation.evaluable import demonstrations_of
 from ftl_lightning.evaluation.evaluator import Evaluator
-from ftl_lightning.evaluation.generation import Generation, execute, generate, tasks_of
-from ftl_lightning.evaluation.judged import TaskResult, share, standard_error
+from ftl_lightning.evaluation.generation import (
+    Generation,
+    TaskResult,
+    demonstrations_of,
+    execute,
+    generate,
+    share,
+    standard_error,
+    tasks_of,
+)
 from ftl_lightning.evaluation.results import append_rows, read_rows
 from ftl_lightning.evaluation.row import Row
 from ftl_lightning.evaluation.rows import configuration
+from ftl_lightning.evaluation.tensorboard import picture
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.point import Point
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
@@ -272,8 +279,8 @@ def test_demonstrations_are_drawn_above_the_samples_that_are_framed_by_outcome(t
         return domain.show.picture(states, right, title, None)
 
     watched = replace(domain, show=replace(domain.show, picture=drawn))
-    behaviour = TaskResult.of(EvaluationTask("new concept", task, (task,)), states, None, domain)
-    figure = picture(behaviour, watched, lambda concept: source.draw(concept, 5, 1), 16)
+    behaviour = TaskResult.of(EvaluationTask("new concept", task, (task,)), states, None, domain, source.draw(task, 5, 1))
+    figure = picture(behaviour, watched, 16)
     assert seen == [(5, None), (4, [True, True, True, False])]
     assert [text.get_text() for text in figure.texts] == [
         f"{task}: 0.75 right",
@@ -282,7 +289,7 @@ def test_demonstrations_are_drawn_above_the_samples_that_are_framed_by_outcome(t
     ]
     assert figure.axes[0].get_position().y0 > figure.axes[1].get_position().y1
     seen.clear()
-    picture(behaviour, watched, lambda concept: None, 2)
+    picture(replace(behaviour, demonstrations=None), watched, 2)
     assert seen == [(2, [True, True])]
 
 

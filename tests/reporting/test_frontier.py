@@ -6,7 +6,7 @@ import pytest
 
 from ftl_lightning.cli.main import main
 from ftl_lightning.domains.registry import load_domain
-from ftl_lightning.evaluation.diversity import FRESH, REPLAYED
+from ftl_lightning.evaluation.references import FRESH, REPLAYED
 from ftl_lightning.evaluation.results import append_rows
 from ftl_lightning.reporting.figures import frontier
 from ftl_lightning.reporting.frontier import frontier_table, read_frontier, write_frontier

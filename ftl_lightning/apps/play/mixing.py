@@ -17,11 +17,11 @@ from ftl_lightning.domains.domain import SUCCESS, Domain
 from ftl_lightning.domains.execution import Rollout
 from ftl_lightning.domains.films import VectorFilm
 from ftl_lightning.domains.pictures import Show, line_film
-from ftl_lightning.evaluation.films import packed, packed_space
+from ftl_lightning.evaluation.pictures import packed, packed_space
 from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.services.errors import UserError, short
-from ftl_lightning.training.judging import judging_domain
+from ftl_lightning.training.quality import judging_domain, right_plans
 
 Json = dict[str, Any]
 STEPS = 10
@@ -94,13 +94,11 @@ def judged(domain: Domain, plans: Demonstrations, goal: str) -> tuple[list[Json]
         plans: samples.
         goal: goal of the samples; empty for none.
     """
-    if goal and domain.metrics:
-        measured = domain.measure(goal, plans.states, plans.initial_states)
-        for name, right in measured.items():
-            if right.dtype == torch.bool and right.dim():
-                share = float(right.float().mean())
-                return films(domain, plans, right.tolist()), f"{share:.0%} right ({name.replace('_', ' ')}: {goal})"
-    return films(domain, plans), ""
+    success = right_plans(domain.measure(goal, plans.states, plans.initial_states)) if goal else None
+    if success is None:
+        return films(domain, plans), ""
+    name, right = success
+    return films(domain, plans, right.tolist()), f"{float(right.float().mean()):.0%} right ({name.replace('_', ' ')}: {goal})"
 
 
 def samples(model: FewShot, mixture: Mixture, asked: Sample, tasks: Sequence[str]) -> tuple[list[Json], str, Sampled]:

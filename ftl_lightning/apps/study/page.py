@@ -14,7 +14,7 @@ import numpy as np
 from ftl_lightning.apps.study.questions import Questions, film_id
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.films import ABOVE, Wireframe, seen, window
-from ftl_lightning.evaluation.animation import frame_milliseconds, gif
+from ftl_lightning.evaluation.pictures import frame_milliseconds, gif
 from ftl_lightning.services.errors import UserError, require, short
 from ftl_lightning.services.escape import script_json
 from ftl_lightning.services.printing import line, plain

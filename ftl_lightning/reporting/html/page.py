@@ -12,7 +12,7 @@ import pandas as pd
 
 from ftl_lightning.domains.comparison import OURS, Compared
 from ftl_lightning.domains.domain import CLOSED, Domain
-from ftl_lightning.evaluation.films import FORMAT
+from ftl_lightning.evaluation.pictures import FORMAT
 from ftl_lightning.evaluation.results import COMPARISON, CURVES, latest, read_rows, read_study
 from ftl_lightning.evaluation.row import METHOD, REFERENCE, label
 from ftl_lightning.igm.concept import Concept

@@ -3,4 +3,4 @@
 from pathlib import Path
 
 FILM = Path(__file__).parent / "film.js"
-"""Draws the films of :mod:`ftl_lightning.evaluation.films`; the first script of a page, as it says ``"use strict"``."""
+"""Draws the films of :mod:`ftl_lightning.evaluation.pictures`; the first script of a page, as it says ``"use strict"``."""

@@ -14,7 +14,7 @@ import torch
 from ftl_lightning.apps.benchmark.strokes import strokes
 from ftl_lightning.apps.play.page import page, request_key
 from ftl_lightning.domains.pictures import path_film
-from ftl_lightning.evaluation.films import packed
+from ftl_lightning.evaluation.pictures import packed
 
 if TYPE_CHECKING:
     from tests.apps.play.browser import Browser

@@ -13,7 +13,9 @@ from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.from_file import own_domain
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.domains.tasks import EvaluationTask
-from ftl_lightning.evaluation.diversity import FRESH, REPLAYED, Real, coverage, lines, novelty
+from ftl_lightning.evaluation import references
+from ftl_lightning.evaluation.generation import TaskResult
+from ftl_lightning.evaluation.references import FRESH, REPLAYED, Real, coverage, lines, novelty
 from ftl_lightning.evaluation.results import read_rows
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.seeding import DEMONSTRATION_SEED
@@ -26,6 +28,12 @@ TASK = EvaluationTask("new concept", NEW, learned=(NEW,))
 
 def five(domain: Domain = SCENES, goal: str = NEW) -> Demonstrations:
     return domain.source(None).draw(goal, 5, DEMONSTRATION_SEED)
+
+
+def real_of(task: EvaluationTask, domain: Domain, count: int, demonstrations: Demonstrations | None) -> Real:
+    """Real behaviour for as many generated plans."""
+    plans = torch.zeros(count, domain.plans.horizon, len(domain.plans.columns))
+    return Real.of(TaskResult(task, plans, {}, demonstrations=demonstrations), domain)
 
 
 def test_novelty_and_coverage_of_three_plans_and_the_distance_of_paths_by_hand() -> None:
@@ -51,7 +59,7 @@ def test_a_scaled_distance_does_not_depend_on_units_and_leaves_constant_columns_
 
 
 def test_replayed_demonstrations_have_novelty_0_and_fresh_samples_are_none_nor_those_that_are_to_be_covered() -> None:
-    real = Real.of(TASK, SCENES, 20, five())
+    real = real_of(TASK, SCENES, 20, five())
     found = real.lines()
     assert found[REPLAYED].values["novelty"] == 0
     assert found[REPLAYED].values["accuracy"] == found[FRESH].values["accuracy"] == 1
@@ -66,7 +74,7 @@ def test_replayed_demonstrations_have_novelty_0_and_fresh_samples_are_none_nor_t
 
 
 def test_more_plans_never_increase_the_distance_of_coverage() -> None:
-    real = Real.of(TASK, SCENES, 40, five())
+    real = real_of(TASK, SCENES, 40, five())
     plans = SCENES.comparison.references["random scenes"](NEW, 40, None, 0)
     found = [real.values(plans[:count])["coverage"] for count in range(1, 41)]
     assert found == sorted(found, reverse=True)
@@ -75,7 +83,7 @@ def test_more_plans_never_increase_the_distance_of_coverage() -> None:
 
 def test_wider_plans_do_not_seem_nearer_for_it() -> None:
     """Scales are those of real behaviour, so that noise has its full distance."""
-    real = Real.of(TASK, replace(SCENES, comparison=replace(SCENES.comparison, distance=None)), 10, five())
+    real = real_of(TASK, replace(SCENES, comparison=replace(SCENES.comparison, distance=None)), 10, five())
     values = [real.values(five().states * width)["novelty"] for width in (2, 20)]
     assert values[1] > 5 * values[0] > 0
 
@@ -93,13 +101,13 @@ def test_wider_plans_do_not_seem_nearer_for_it() -> None:
 )
 def test_what_there_is_to_compare_with_depends_on_the_task(task: EvaluationTask, names: list[str]) -> None:
     known = five() if task.learned else None
-    assert list(Real.of(task, SCENES, 5, known).values(five().states)) == names
+    assert list(real_of(task, SCENES, 5, known).values(five().states)) == names
 
 
 @pytest.mark.slow
 def test_a_task_that_cannot_be_drawn_has_no_coverage(caplog: pytest.LogCaptureFixture) -> None:
     impossible = "circle above square and square above circle"
-    real = Real.of(EvaluationTask("s", impossible, texts=("circle above square",)), SCENES, 1, None)
+    real = real_of(EvaluationTask("s", impossible, texts=("circle above square",)), SCENES, 1, None)
     assert real.values(five().states) == {}
     assert real.lines() == {}
     assert lines([real]) == {}
@@ -110,7 +118,7 @@ def test_driving_has_novelty_alone_since_its_expert_is_slow() -> None:
     driving = load_domain("driving")
     demonstrations = driving.source(None).split("validation", 3, 0)
     task = EvaluationTask("new initial state", "highway", learned=("highway",))
-    real = Real.of(task, driving, 3, demonstrations)
+    real = real_of(task, driving, 3, demonstrations)
     rows = torch.arange(3)
     plans = demonstrations.windows(rows, 0 * rows, driving.plans.horizon)[0]
     assert real.values(plans) == {"novelty": 0}
@@ -129,7 +137,7 @@ def test_distances_that_do_not_fit_are_refused_in_one_line() -> None:
 def test_a_plan_that_is_not_finite_covers_nothing_and_is_far_from_everything() -> None:
     states = five().states
     broken = torch.full_like(states[:1], torch.nan)
-    real = Real.of(TASK, SCENES, 5, five())
+    real = real_of(TASK, SCENES, 5, five())
     assert real.values(torch.cat((states, broken)))["coverage"] == real.values(states)["coverage"]
     assert real.values(broken)["novelty"] == torch.inf
 
@@ -166,6 +174,20 @@ def test_paths_of_driving_are_seen_from_their_start_and_heading() -> None:
     assert driving.comparison.distance(north, slower).item() == pytest.approx((64 / 8) ** 0.5)
 
 
+def test_the_cache_forgets_the_oldest_value(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(references, "_CACHE", {})
+    monkeypatch.setattr(references, "KEPT", 2)
+    computed: list[str] = []
+
+    def value(key: str) -> str:
+        computed.append(key)
+        return key
+
+    for key in "aabcba":
+        assert references._cached(key, lambda key=key: value(key)) == key
+    assert computed == ["a", "b", "c", "a"]
+
+
 def test_own_behaviour_is_compared_by_time_warping_and_has_no_fresh_samples() -> None:
     time = torch.linspace(0, 1, 12)
 
@@ -176,7 +198,7 @@ def test_own_behaviour_is_compared_by_time_warping_and_has_no_fresh_samples() ->
     examples = Demonstrations(states, torch.full((3,), 12), "own", ("x", "y"), ("", ""), ("a", "a", "b"))
     domain = own_domain(examples, ("a", "b"), 12, {"nearest_demonstration": 1})
     task = EvaluationTask("new concept", "a", learned=("a",))
-    real = Real.of(task, domain, 4, examples.select("a"))
+    real = real_of(task, domain, 4, examples.select("a"))
     assert list(real.values(states)) == ["novelty"]
     assert real.lines()[REPLAYED].values["novelty"] == 0
     assert FRESH not in real.lines()
