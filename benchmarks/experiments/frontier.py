@@ -26,7 +26,7 @@ from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.evaluation.diversity import Real, lines, real_behaviour
 from ftl_lightning.evaluation.generation import Generation, generate
 from ftl_lightning.evaluation.judged import TaskResult
-from ftl_lightning.reporting.frontier import NOISY, read_frontier, write_frontier
+from ftl_lightning.reporting.measurements import NOISY, read_frontier, write_frontier
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.progress import bar
 from ftl_lightning.services.shipped import shipped

@@ -34,7 +34,7 @@ from ftl_lightning.igm.guidance import composed_epsilon
 from ftl_lightning.igm.samplers import Sampling, ddpm
 from ftl_lightning.igm.schedule import denoising_loss
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
-from ftl_lightning.reporting.speed import ONE, PUBLISHED, TEN, Measured, reached
+from ftl_lightning.reporting.measurements import ONE, PUBLISHED, TEN, Measured, reached
 from ftl_lightning.services.progress import bar
 from ftl_lightning.services.seeding import generator, task_key
 from ftl_lightning.services.tensor_file import write_text

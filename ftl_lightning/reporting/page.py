@@ -16,13 +16,12 @@ from ftl_lightning.evaluation.films import FORMAT
 from ftl_lightning.evaluation.results import COMPARISON, CURVES, latest, read_rows, read_study
 from ftl_lightning.evaluation.row import METHOD, REFERENCE, label
 from ftl_lightning.igm.concept import Concept
-from ftl_lightning.reporting.colours import COLOURS, colours
 from ftl_lightning.reporting.comparison import METHODS, all_methods, compared, methods, reference_lines, shown_lines
-from ftl_lightning.reporting.concept_places import concept_places
-from ftl_lightning.reporting.curves import AXES, points
-from ftl_lightning.reporting.shown import decisive, domain_of, lookup, settings
-from ftl_lightning.reporting.speed import read_speed
-from ftl_lightning.reporting.table import of_method, select, summarise
+from ftl_lightning.reporting.concept_figures import concept_places
+from ftl_lightning.reporting.figures import COLOURS, colours
+from ftl_lightning.reporting.measurements import read_speed
+from ftl_lightning.reporting.table import decisive, domain_of, lookup, of_method, select, settings, summarise
+from ftl_lightning.reporting.tables import AXES, points
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.printing import say
 from ftl_lightning.services.schema import read_json
