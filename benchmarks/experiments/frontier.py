@@ -2,9 +2,9 @@
 
     python benchmarks/experiments/frontier.py --domain object_rearrangement --suite validation --out results/frontier.json
 
-Each method, ours in each of its forms, learns the concepts of a suite from five demonstrations once a seed, with the models that
-ship, and generates every task of the suite that starts in new initial states at each temperature. A file that has rows already is
-gone on with: only what is missing is measured. `python -m ftl_lightning report` draws ``results/frontier.json``.
+Each method (ours in each form) learns the concepts of a suite from five demonstrations for each seed, with the shipped models, and
+generates every task with new initial states at each temperature. Rows that exist in the file are not measured again. `python -m
+ftl_lightning report` plots ``results/frontier.json``.
 """
 
 import argparse

@@ -57,8 +57,7 @@ OTHER_FORMS = "other forms"
 def all_methods(comparison: pd.DataFrame, ablations: pd.DataFrame) -> pd.DataFrame:
     """Rows of all domains with a measured baseline: from the comparison, or from ablations for domains that it lacks.
 
-    Args:
-        comparison, ablations: rows of the results; ablations contribute the most measured configuration of each method.
+    Ablations contribute the most measured configuration of each method.
     """
     compared_domains = set(comparison["domain"])
     others = [
@@ -90,12 +89,7 @@ def methods(rows: pd.DataFrame) -> list[Compared]:
 def comparison_table(domain: Domain, results: pd.DataFrame, shown: Sequence[str] = ()) -> Table:
     """Table of all methods: paired test, mean with errors, the paper's number and the difference.
 
-    There is a line for each setting, metric and method.
-
-    Args:
-        domain: the domain.
-        results: rows of the results.
-        shown: metrics; if empty, those by which methods are compared.
+    There is a line for each setting, metric in ``shown`` (if empty, those by which methods are compared), and method.
     """
     rows = compared(domain, results)
     lines = []
@@ -180,11 +174,7 @@ def _comparable(domain: Domain, rows: pd.DataFrame, setting: str, metric: str) -
 
 
 def overview(results: pd.DataFrame) -> Table:
-    """All domains: the lead, ours and the baselines, with the paper's numbers in brackets.
-
-    Args:
-        results: rows of a comparison; see :func:`all_methods`.
-    """
+    """All domains of :func:`all_methods`: the lead, ours and the baselines, with the paper's numbers in brackets."""
     return _overview(results, shown_lines(results), methods(results))
 
 

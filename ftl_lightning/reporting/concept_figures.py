@@ -85,10 +85,9 @@ def concept_map(model: ConceptModel, concepts: Sequence[Concept], seed: int = 0)
 
 
 def check_figure(checks: Sequence[Check]) -> Figure:
-    """Plot demonstrations, their distances and leave-one-out losses: a row for each concept; odd or faulty demonstrations are red.
+    """Plot demonstrations, their distances and leave-one-out losses; odd or faulty demonstrations are red.
 
-    Args:
-        checks: checks of concepts; the first :data:`MOST` are drawn.
+    There is a row for each concept, at most :data:`MOST`.
     """
     shown = checks[:MOST]
     columns = 2 + 2 * any(check.left_out for check in shown)

@@ -97,12 +97,7 @@ def _label_bars(axes: Axes, places: Sequence[float], shown: Sequence[str], metri
 def accuracy_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy") -> Figure:
     """Plot a metric of every setting beside the paper's numbers and reference lines, for K = 2 or else the most measured K.
 
-    Error bars are standard errors over tasks.
-
-    Args:
-        domain: the domain.
-        results: rows of the results file.
-        metric: its name in the results.
+    Error bars are standard errors over tasks. ``results`` are rows of a results file.
     """
     rows = labelled(latest(select(results, domain=domain.name, metric=metric)))
     ours, how = main_rows(rows, main_omega(domain))
@@ -132,12 +127,7 @@ def accuracy_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy
 def comparison_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy") -> Figure:
     """Plot a metric of every setting for ours and the baselines, with reference lines and the paper's numbers as diamonds.
 
-    Error bars are standard errors over tasks.
-
-    Args:
-        domain: the domain.
-        results: rows of a comparison.
-        metric: its name in the results.
+    Error bars are standard errors over tasks. ``results`` are rows of a comparison.
     """
     rows = compared(domain, results)
     names = methods(rows)
@@ -178,10 +168,8 @@ def overview_dots(results: pd.DataFrame) -> Figure:
     """Plot all domains, settings and metrics of a comparison: a marker for each method, with standard errors over tasks.
 
     Open diamonds are the paper's numbers of the same method; ticks are reference lines. Our forms are limited to the paper's,
-    automatically chosen forms and the default forms of the domains.
-
-    Args:
-        results: see :func:`~ftl_lightning.reporting.comparison.all_methods`.
+    automatically chosen forms and the default forms of the domains. Rows are those of
+    :func:`~ftl_lightning.reporting.comparison.all_methods`.
     """
     lines = shown_lines(results)
     series = _series(methods(results), {domain.ours for domain, _, _ in lines})
@@ -259,12 +247,7 @@ def _labelled_methods(rows: pd.DataFrame) -> list[tuple[str, Compared]]:
 
 
 def growth(domain: Domain, results: pd.DataFrame) -> Figure:
-    """Plot accuracy against the number of demonstrations and against K, with standard errors over tasks.
-
-    Args:
-        domain: the domain.
-        results: rows of curves.
-    """
+    """Plot accuracy against the number of demonstrations and against K, with standard errors over tasks, from rows of curves."""
     figure = Figure(figsize=(8, 3.2), layout="constrained")
     for axes, axis in zip(figure.subplots(1, len(AXES), sharey=True), AXES, strict=True):
         rows = points(domain, results, axis)
@@ -288,11 +271,8 @@ def frontier(domain: Domain, rows: pd.DataFrame) -> Figure:
     """Plot accuracy over coverage for each suite and setting: a line for each method, temperature from dark to light.
 
     Points are means over tasks and seeds. Less coverage is better, so better methods lie further up and to the left. Crosses and
-    stars are the reference lines *demonstrations replayed* and *fresh samples*.
-
-    Args:
-        domain: the domain.
-        rows: see :func:`ftl_lightning.reporting.measurements.read_frontier`.
+    stars are the reference lines *demonstrations replayed* and *fresh samples*. Rows are those of
+    :func:`~ftl_lightning.reporting.measurements.read_frontier`.
     """
     rows = rows[rows["domain"] == domain.name].dropna(subset=["accuracy", "coverage"])
     rows = rows.assign(panel=rows["setting"] + (", " + rows["suite"] if len(set(rows["suite"])) > 1 else ""))
@@ -303,12 +283,8 @@ def frontier(domain: Domain, rows: pd.DataFrame) -> Figure:
     colour_of = colours(_labelled_methods(lines))
     for axes, panel in zip(panels, shown, strict=False):
         for label, colour in colour_of.items():
-            means = (
-                select(lines, panel=panel, label=label)
-                .groupby("temperature", dropna=False)[["coverage", "accuracy"]]
-                .mean()
-                .sort_index()
-            )
+            by_temperature = select(lines, panel=panel, label=label).groupby("temperature", dropna=False)
+            means = by_temperature[["coverage", "accuracy"]].mean().sort_index()
             if means.empty:
                 continue
             axes.plot(means["coverage"], means["accuracy"], color=colour, linewidth=1, label=figure_text(label))
@@ -329,11 +305,7 @@ def frontier(domain: Domain, rows: pd.DataFrame) -> Figure:
 
 
 def learning_time(curves: Mapping[str, Sequence[Measured]]) -> Figure:
-    """Plot accuracy over seconds of learning, a line for each curve; the dotted line is the accuracy that all curves reach.
-
-    Args:
-        curves: see :func:`ftl_lightning.reporting.measurements.read_speed`.
-    """
+    """Plot accuracy over seconds of learning, a line for each curve; the dotted line is the accuracy that all curves reach."""
     figure = Figure(figsize=(6, 3.6), layout="constrained")
     axes = figure.subplots()
     for colour, (name, curve) in zip(COLOURS, curves.items(), strict=False):

@@ -89,11 +89,7 @@ class Measured:
 
 
 def read_speed(path: str | Path) -> dict[str, list[Measured]]:
-    """Read the curves of a file, or of its folder; empty if there is no file.
-
-    Raises:
-        UserError: for an invalid file, naming file and row.
-    """
+    """Read the curves of :data:`SPEED` by name; arguments and errors as in :func:`_read`."""
     curves: dict[str, list[Measured]] = {}
     for measured in _read(path, SPEED, "curves", Measured, "curves of steps, seconds and accuracy"):
         curves.setdefault(measured.curve, []).append(measured)
@@ -125,23 +121,14 @@ class _FrontierRow:
 
 
 def read_frontier(path: str | Path) -> pd.DataFrame:
-    """Read the measurements of a file, or of its folder; empty if there is no file.
-
-    Raises:
-        UserError: for an invalid file, naming file and row.
-    """
+    """Read the measurements of :data:`FRONTIER`; arguments and errors as in :func:`_read`."""
     rows = _read(path, FRONTIER, "rows", _FrontierRow, f"rows of {', '.join(COLUMNS)}")
     table = pd.DataFrame(map(asdict, rows), columns=COLUMNS)
     return table.astype(dict.fromkeys(["temperature", *_MEASURES], float)) if rows else table
 
 
 def write_frontier(path: str | Path, rows: Sequence[dict[str, Any]]) -> None:
-    """Add measurements to a file atomically; equal subjects are replaced.
-
-    Args:
-        path: the file; created if missing.
-        rows: values by :data:`COLUMNS`.
-    """
+    """Add measurements, values by :data:`COLUMNS`, to a file atomically; equal subjects are replaced."""
     known = read_frontier(path)
     table = pd.DataFrame(rows, columns=COLUMNS)
     table = pd.concat([known, table], ignore_index=True) if len(known) else table
@@ -152,15 +139,7 @@ def write_frontier(path: str | Path, rows: Sequence[dict[str, Any]]) -> None:
 
 
 def accuracy_at(rows: pd.DataFrame, coverage: float) -> float | None:
-    """Interpolate the accuracy of a method at a coverage, between measured temperatures.
-
-    Args:
-        rows: rows of a method and suite; averaged over tasks and seeds.
-        coverage: the coverage.
-
-    Returns:
-        Accuracy; ``None`` outside the measured coverage.
-    """
+    """Interpolate the mean accuracy of a method at a coverage, between temperatures; ``None`` outside the measured coverage."""
     means = rows.groupby("temperature")[["coverage", "accuracy"]].mean().sort_values("coverage")
     if means.empty or not means["coverage"].iloc[0] <= coverage <= means["coverage"].iloc[-1]:
         return None
@@ -168,12 +147,9 @@ def accuracy_at(rows: pd.DataFrame, coverage: float) -> float | None:
 
 
 def frontier_table(domain: Domain, rows: pd.DataFrame) -> Table:
-    """Accuracy, novelty and coverage of each method at every temperature, and its accuracy at the coverage of ours at temperature 1
-    with one set of embeddings.
+    """Accuracy, novelty and coverage of each method at every temperature, from rows of :func:`read_frontier`.
 
-    Args:
-        domain: the domain.
-        rows: see :func:`read_frontier`.
+    The last column is its accuracy at the coverage of the paper's form at temperature 1.
     """
     lines = []
     rows = rows[rows["domain"] == domain.name].dropna(subset=["coverage"])

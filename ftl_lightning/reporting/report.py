@@ -91,11 +91,7 @@ def write_report(results: Path, out: Path, readme: Path | None = None) -> str:
 
 
 def _check_few(results: Path, studies: Sequence[pd.DataFrame]) -> None:
-    """Refuse results whose tables would be unreadable and take hours.
-
-    Raises:
-        UserError: naming the exceeded limit.
-    """
+    """Refuse results whose tables would be unreadable and take hours."""
     domains = len({name for rows in studies for name in rows["domain"]})
     require(domains <= MOST_DOMAINS, str(results), f"at most {MOST_DOMAINS} domains", f"{domains}; report fewer files at a time")
     for domain, domain_rows in (group for rows in studies for group in rows.groupby("domain")):

@@ -290,11 +290,6 @@ def points(domain: Domain, results: pd.DataFrame, axis: str) -> pd.DataFrame:
     The other column of :data:`AXES` and the guidance weight have the values with most points on the axis. Ties go to the weight of
     the main tables for demonstrations, and to learned weights for K, as fixed weights per component would increase guidance with
     K. Settings with the initial states of the demonstrations are left out: they have no more samples than demonstrations.
-
-    Args:
-        domain: the domain.
-        results: rows of the results file.
-        axis: ``'demonstrations'`` or ``'K'``.
     """
     rows = latest(select(results, domain=domain.name, role=METHOD))
     rows = select(rows, metric=decisive(domain, rows))
@@ -326,18 +321,15 @@ def changes_table(domain: Domain, results: pd.DataFrame) -> Table:
 
     There is a line for each variant in the order of the rows, and a column for each setting. The metric is the domain's headline or
     else its main metric.
-
-    Args:
-        domain: the domain.
-        results: rows of the results file.
     """
     rows = latest(select(results, domain=domain.name, role=METHOD))
     metric = decisive(domain, rows)
     rows = select(rows, metric=metric)
     columns = list(dict.fromkeys(rows["setting"]))
-    lines = []
-    for variant in dict.fromkeys(rows["variant"]):
-        lines.append([variant, *(_cell(select(rows, variant=variant, setting=setting)) for setting in columns)])
+    lines = [
+        [variant, *(_cell(select(rows, variant=variant, setting=setting)) for setting in columns)]
+        for variant in dict.fromkeys(rows["variant"])
+    ]
     caption = (
         f"{domain.name}: {metric} of ours, and with one change to the paper's form taken away at a time. "
         "Mean ± standard error over tasks (spread over seeds)"

@@ -17,7 +17,7 @@ from ftl_lightning.evaluation.judged import TaskResult
 from ftl_lightning.evaluation.results import read_rows
 from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
-from ftl_lightning.networks.hashing import HashingEncoder
+from ftl_lightning.networks.text_encoder import HashingEncoder
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.training import InversionModule, PretrainingModule
 from ftl_lightning.training.data import InversionData, OwnData
