@@ -96,9 +96,9 @@ class ConditionEncoder(nn.Module, ABC):
     def observe(self, vector: Tensor) -> Context:
         """Encode the concatenated, normalised observed vectors ``(batch, m)`` independently of the concept."""
 
-    @abstractmethod
     def attend(self, context: Context, concept: Tensor) -> Tensor:
-        """Features ``(batch, width)`` of a context for ``concept (batch, n)``."""
+        """Features ``(batch, width)`` of a context for ``concept (batch, n)``; by default the first value of ``observe``."""
+        return context[0]
 
     def direction(self, context: Context, concept: Tensor) -> Tensor | None:
         """Unit vector ``(batch, 2)`` of the plan's x axis; ``None`` for unrotated plans."""
@@ -123,9 +123,6 @@ class FlatEncoder(ConditionEncoder):
 
     def observe(self, vector: Tensor) -> Context:
         return (self.net(vector),)
-
-    def attend(self, context: Context, concept: Tensor) -> Tensor:
-        return context[0]
 
 
 class JointEncoder(ConditionEncoder):
@@ -185,7 +182,7 @@ class EntityEncoder(_Entities):
 
     The concept determines a weight for each attribute column. The attention logit of an entity is the weighted sum of its
     attributes, so the weights for *red* and for *bowl* add up to those of an unseen red bowl. The values exclude the attributes, so
-    a plan to a red bowl equals a plan to any other object. There is a single head: several heads can disagree about the target,
+    a red bowl is approached like any other object. There is a single head: several heads can disagree about the target,
     which traps concepts learned through them. The encoder is invariant to exchanging entities.
 
     Args:
@@ -200,8 +197,8 @@ class EntityEncoder(_Entities):
         self.rest = [column for column in range(self.columns.shape[1]) if column not in sizes.attributes]
         inner = 2 * width
         self._build(len(self.rest), inner)
-        # Saturated attention to a wrong entity has no gradient. Weights start small, and the concept is scaled to norm 1, so that
-        # a step of Adam changes the query a little; at the original norm of 20 it would reverse the query.
+        # Saturated attention to a wrong entity has hardly any gradient. Weights start small, and the concept is scaled to norm 1,
+        # so that a step of Adam changes the query a little; at the original norm of 20 it would reverse the query.
         self.query = nn.Linear(sizes.concept_dim, len(self.attributes))
         if not self.query.weight.is_meta:  # on the meta device torch would import its compiler
             nn.init.normal_(self.query.weight, std=0.2)
@@ -243,9 +240,6 @@ class SetEncoder(_Entities):
         shared = vector[:, self.shared]
         hidden = self._hidden(vector[:, self.columns], shared)
         return (self.out(torch.cat((hidden.amax(dim=1), hidden.mean(dim=1), shared), dim=-1)),)
-
-    def attend(self, context: Context, concept: Tensor) -> Tensor:
-        return context[0]
 
 
 class PointEncoder(ConditionEncoder):

@@ -155,7 +155,7 @@ class HashingEncoder:
         return f"hashing-{DIMENSION}"
 
     def __call__(self, texts: Sequence[str]) -> Tensor:
-        """Embeddings ``(text, 384)`` float32 of unit length; zeros for an empty or blank text."""
+        """Embeddings ``(text, DIMENSION)`` float32 of unit length; zeros for an empty or blank text."""
         sums = torch.zeros(len(texts), DIMENSION, dtype=torch.float64)
         for row, text in enumerate(texts):
             for feature in _features(text):

@@ -22,7 +22,7 @@ from ftl_lightning.reporting.figures import COLOURS, colours
 from ftl_lightning.reporting.measurements import read_speed
 from ftl_lightning.reporting.table import decisive, domain_of, lookup, of_method, select, settings, summarise
 from ftl_lightning.reporting.tables import AXES, points
-from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.errors import UserError, require
 from ftl_lightning.services.printing import say
 from ftl_lightning.services.schema import read_json
 from ftl_lightning.services.shipped import shipped
@@ -117,8 +117,8 @@ def _films(results: Path, shown: Sequence[Domain], rows: pd.DataFrame) -> tuple[
     films, shapes = [], {}
     for path in visible(results / FILMS, "*.json"):
         content = read_json(path)
-        if not isinstance(content, dict) or content.get("format") != FORMAT:
-            raise UserError(f"{path}: expected films of format {FORMAT}, found something else; make them with evaluation.films")
+        is_films = isinstance(content, dict) and content.get("format") == FORMAT
+        require(is_films, str(path), f"films of format {FORMAT}", "something else; make them with evaluation.films")
         try:
             if (name := str(content["domain"])) in decided:
                 shapes[path.stem] = content["shapes"]
