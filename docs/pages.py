@@ -17,7 +17,7 @@ from ftl_lightning.apps.benchmark.strokes import strokes
 from ftl_lightning.apps.play.page import WEIGHTS, write_offline
 from ftl_lightning.apps.play.requests import Learn
 from ftl_lightning.apps.play.workspace import Workspace
-from ftl_lightning.reporting.html.page import write_page
+from ftl_lightning.reporting.page import write_page
 
 PLAYABLE = {
     "strokes": (("heart", "circle"), ("heart", "zigzag"), ("heart", "figure eight"), ("circle", "zigzag")),

@@ -25,8 +25,7 @@ from ftl_lightning.domains.registry import domain_of_file
 from ftl_lightning.evaluation.results import latest, read_rows
 from ftl_lightning.few_shot.tuned import ModelSettings
 from ftl_lightning.reporting.paired import mcnemar, up
-from ftl_lightning.reporting.shown import lookup
-from ftl_lightning.reporting.table import Number, select, summarise
+from ftl_lightning.reporting.table import Number, lookup, select, summarise
 from ftl_lightning.reporting.tables import against
 from ftl_lightning.services.configuration import load
 

@@ -15,7 +15,7 @@ from packaging.requirements import Requirement
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.driving.traffic import SHIPPED
 from ftl_lightning.domains.mocap.measures import learned_elsewhere
-from ftl_lightning.reporting.figures import concept_map
+from ftl_lightning.reporting.concept_figures import concept_map
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.extras import EXTRAS, check_extra
 from tests.conftest import CONF, ROOT, environment, refused

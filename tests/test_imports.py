@@ -63,7 +63,7 @@ Workspace("strokes", None).work()
 found("play")
 """
 REPORTS = """
-import ftl_lightning.reporting.report, ftl_lightning.reporting.html.page, ftl_lightning.apps.study.report
+import ftl_lightning.reporting.report, ftl_lightning.reporting.page, ftl_lightning.apps.study.report
 found("report")
 """
 PROGRAM = f"""

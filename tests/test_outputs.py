@@ -29,10 +29,9 @@ from ftl_lightning.evaluation.row import Row
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.reporting import report
 from ftl_lightning.reporting.figures import accuracy_bars
-from ftl_lightning.reporting.frontier import read_frontier
+from ftl_lightning.reporting.measurements import read_frontier, read_speed
 from ftl_lightning.reporting.report import write_report
-from ftl_lightning.reporting.shown import domain_of
-from ftl_lightning.reporting.speed import read_speed
+from ftl_lightning.reporting.table import domain_of
 from ftl_lightning.services.escape import figure_text, latex, latex_row, markdown
 from ftl_lightning.services.printing import line, plain, say
 from tests import conftest

@@ -1,7 +1,8 @@
-"""How often ``check`` finds what is wrong with one of five demonstrations, and how often it finds fault with good ones.
+"""Detection rate and false alarms of ``check`` for faulty demonstrations among five.
 
-Sets of five of a concept are taken from pools; the last demonstration is spoilt in one way, and found if a warning names it. Then,
-with models, the last one is of another concept, and concepts are learned from all but one: the odd one is found if it is named.
+Sets of five demonstrations of a concept are drawn from pools. The last demonstration has a single fault, which is detected if a
+warning names the demonstration. With models, the last demonstration shows another concept, and concepts are learned from all but
+one demonstration (leave-one-out); the odd demonstration is detected if it is named.
 
     python benchmarks/experiments/check.py --out results/check.json
 """

@@ -1,11 +1,11 @@
-"""At which timesteps the concept matters: a model's loss on held-out demonstrations, told their concept, others, and none.
+"""Influence of the concept by timestep: loss on held-out demonstrations with their concept, other concepts, and none.
 
     python benchmarks/experiments/concept_in_loss.py --pretrained agent
     python benchmarks/experiments/concept_in_loss.py --pretrained logs/changes/agent-paper0/pretrained \
         --out results/concept_in_loss.json
 
-The loss is the squared error of the noise (Eq. 1), from where each demonstration starts. *others* and *none* are what it grows by
-if the model is told another training concept (the mean of all) or the empty one: 0 where the model does not use the concept.
+The loss is the squared error of the noise (Eq. 1), given the initial state of each demonstration. *others* and *none* are the
+increases of the loss with another training concept (mean over all) and with the empty concept; 0 if the model ignores the concept.
 """
 
 import argparse

@@ -1,7 +1,7 @@
-"""Families of behaviour on which the form of concepts is chosen and judged: generators with rules that the method does not know.
+"""Families of behaviour for the choice of the parametrisation: generators, with rules unknown to the method as judges.
 
-Paths, pictures and series are data of one's own, pretrained on with ``conf/own.yaml``; relations are those of the shipped model of
-object rearrangement, which pretraining does not show. Reaches and beats are looked at once.
+Paths, pictures and series are users' data, pretrained with ``conf/own.yaml``. Relations are new relations for the shipped model of
+object rearrangement. Reaches and beats are test families, evaluated once.
 """
 
 import zlib

@@ -1,10 +1,10 @@
-"""Which form of a concept is right for which demonstrations, and does the choice find it? Learned from five, judged by rules.
+"""Accuracy of every parametrisation of a concept and of the automatic choice, learned from five demonstrations.
 
-For every new kind of every family of ``benchmarks/experiments/families.py`` a concept is learned in each form and in the chosen
-one. Fifty samples of each are recognised or not by a rule that the method does not know, and measured beside fifty fresh ones:
-spread (standard deviation), novelty (distance to the nearest demonstration) and roughness (second differences), each as a share
-of theirs, columns in units of their spread in pretraining (relations: in fresh scenes; those of pictures are alike). Then pairs
-of learned relations are composed. Models of one's own data are pretrained on first and kept in ``--folder``.
+For every new kind of every family of ``benchmarks/experiments/families.py``, a concept is learned in each form and in the chosen
+form. Fifty samples are classified by a rule unknown to the method and compared with fifty fresh samples of the generator: spread
+(standard deviation), novelty (distance to the nearest demonstration) and roughness (second differences), relative to those of the
+fresh samples. Columns are scaled by their standard deviation in pretraining (relations: in fresh scenes; pictures: unscaled). Then
+pairs of learned relations are composed. Models of users' data are pretrained first and saved in ``--folder``.
 
     python benchmarks/experiments/forms.py --out results/forms.json --figure docs/left_out.png
 """

@@ -2,9 +2,9 @@
 
     python benchmarks/experiments/frontier.py --domain object_rearrangement --suite validation --out results/frontier.json
 
-Each method, ours in each of its forms, learns the concepts of a suite from five demonstrations once a seed, with the models that
-ship, and generates every task of the suite that starts in new initial states at each temperature. A file that has rows already is
-gone on with: only what is missing is measured. `python -m ftl_lightning report` draws ``results/frontier.json``.
+Each method (ours in each form) learns the concepts of a suite from five demonstrations for each seed, with the shipped models, and
+generates every task with new initial states at each temperature. Rows that exist in the file are not measured again. `python -m
+ftl_lightning report` plots ``results/frontier.json``.
 """
 
 import argparse
@@ -27,7 +27,7 @@ from ftl_lightning.evaluation.generation import Generation, TaskResult, generate
 from ftl_lightning.evaluation.references import Real, lines, real_behaviour
 from ftl_lightning.igm.inversion import invert
 from ftl_lightning.igm.settings import GROUPS, InversionSettings
-from ftl_lightning.reporting.frontier import NOISY, read_frontier, write_frontier
+from ftl_lightning.reporting.measurements import NOISY, read_frontier, write_frontier
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.progress import bar
 from ftl_lightning.services.shipped import shipped

@@ -1,9 +1,9 @@
-"""The distribution of poses that learning of human motion starts from: a Gaussian of recorded poses.
+"""Fit the Gaussian of recorded poses that initialises learning of human motion.
 
     python benchmarks/experiments/mocap_beginnings.py --root FOLDER --out ftl_lightning/domains/mocap/beginnings.safetensors
 
-Of each trial of a training concept that is not held out, poses of people who stand or walk with their arms down; each trial counts
-as much as the others.
+Poses are those of people who stand or walk with their arms down, from each trial of a training concept that is not held out. Trials
+have equal weights.
 """
 
 import argparse

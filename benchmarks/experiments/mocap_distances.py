@@ -1,13 +1,13 @@
-"""How far generated motion is from recordings of people, in the features of the judge, beside recordings of other people.
+"""Distance of generated motion to recordings of people in the features of the judge, beside recordings of other people.
 
     python benchmarks/experiments/mocap_distances.py --root FOLDER --concepts results/concepts/mocap/seed0 \
         --out results/mocap_distances.json
 
-FOLDER holds recordings as ``prepare mocap`` leaves them. Each row compares as many windows with recordings of a concept by people
-who did not demonstrate it, and with the distance between two people's recordings of it. Walking by its text is compared with
-recordings of walking, and each person's with that of all others. ``variation`` tells how far two samples from one start are apart,
-beside two recordings of one person and of two. Last, a classifier that has learned from generated motion alone, tested on
-recordings.
+FOLDER contains recordings prepared by ``prepare mocap``. Each row compares equally many windows with recordings of a concept by
+people who did not demonstrate it, and with the distance between the recordings of two people. Walking generated from its text is
+compared with recordings of walking, and each person's recordings with those of all others. ``variation`` is the distance between
+two samples with the same start, beside that between two recordings of a single person and of two people. The last row is the
+accuracy on recordings of a classifier trained on generated motion alone.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""Films of human motion for raters, and the page that shows them: ours, ours with an adapter, text, demonstrations, other people.
+"""Make films of human motion for raters and the study page: ours, with an adapter, by text, demonstrations, other people.
 
     python benchmarks/experiments/mocap_films.py --root FOLDER --out FOLDER2
 

@@ -1,13 +1,13 @@
-"""Train the judge of motion, and say how well it recognises people it has not seen.
+"""Train the judge of motion, and measure how well it recognises actions of people outside its training set.
 
     python benchmarks/experiments/mocap_judge.py --root FOLDER
 
-FOLDER holds recordings as ``prepare mocap`` leaves them. Writes the judge (a minute or two on one thread) and a table of numbers;
-with ``--folds``, also of judges that are trained without the people they are tested on (ten minutes or more for a seed, half of it
-for each further one). The table is written after every seed.
+FOLDER contains recordings prepared by ``prepare mocap``. Writes the judge (a minute or two on one thread) and a table of numbers.
+With ``--folds``, the table includes judges tested on people outside their training set (ten minutes or more for the first seed,
+half of that for each further seed). The table is written after every seed.
 
-Verifiers learn from hard negatives: motion that is nearly an action, made from its recordings. The table says how often such
-motion, made by other rules from people whom the judge has not seen, passes for the action.
+Verifiers learn from hard negatives: near-actions made from recordings of the action. The table reports how often near-actions, made
+by other rules from people outside the training set, are accepted as the action.
 """
 
 import argparse

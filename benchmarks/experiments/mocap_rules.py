@@ -1,4 +1,4 @@
-"""How often the rules of human motion hold in recordings: of the action, and of what training concepts show.
+"""Rates at which the rules of human motion hold in recordings of the action and of training concepts.
 
 python benchmarks/experiments/mocap_rules.py --root FOLDER --out results/mocap_rules.json
 """

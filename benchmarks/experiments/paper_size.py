@@ -1,9 +1,9 @@
-"""What pretraining the paper's form at its size would take in navigation: operations of a step, counted, and seconds, measured.
+"""Cost of pretraining the paper's form at its size in navigation: counted operations and measured seconds of a step.
 
     python benchmarks/experiments/paper_size.py [--out results/paper_size.json]
 
-Operations are multiplications and additions of forward and backward pass; they depend on no machine. Seconds are processor time of
-one thread, the least of some steps. Weights are random: cost does not depend on them.
+Operations are multiplications and additions of forward and backward pass, independent of the machine. Seconds are processor time
+of one thread, the minimum over several steps. Weights are random, as cost does not depend on them.
 """
 
 import argparse
@@ -18,7 +18,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.networks import PAPER_SIZE, TemporalUNet
-from ftl_lightning.networks.denoiser import Sizes
+from ftl_lightning.networks.conditions import Sizes
 from ftl_lightning.services.configuration import load
 from ftl_lightning.services.tensor_file import write_text
 

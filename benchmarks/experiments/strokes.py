@@ -1,9 +1,9 @@
-"""Behaviour that nothing was tuned on, through the command line alone: pen strokes, three kinds learned from five each.
+"""Few-shot learning of pen strokes, data without any tuning, by the command line alone: three kinds from five strokes each.
 
-For each text encoder and seed ``fit`` pretrains on eight kinds with ``conf/own.yaml``, ``invert`` learns three with the same,
-and fifty strokes of every kind are drawn. A rule that the method does not know, the nearest of sixty templates of each of eleven
-kinds, says what they are. Spread, novelty and roughness of the new kinds are shares of fresh strokes'. Reference lines: fresh
-strokes of the generator, and what the model draws with the empty concept.
+For each text encoder and seed, ``fit`` pretrains on eight kinds with ``conf/own.yaml``, ``invert`` learns three kinds with the same
+configuration, and fifty strokes of every kind are sampled. A rule unknown to the method, the nearest of sixty templates of each of
+eleven kinds, classifies them. Spread, novelty and roughness of the new kinds are relative to those of fresh strokes. Reference
+lines are fresh strokes of the generator and unconditional samples.
 
     python benchmarks/experiments/strokes.py --out results/strokes.json
 """

@@ -1,11 +1,11 @@
-"""Corrections of a model that pushes: it drives in scenes of training tasks, and the expert takes over and goes on from there.
+"""Record corrections of a table-top model: the model acts in scenes of training tasks, then the expert takes over.
 
     python benchmarks/experiments/tabletop_dagger.py --pretrained pretrained/tabletop --count 200 --seed 1 \
         --out corrections.safetensors
     python -m ftl_lightning fit --config conf/tabletop.yaml --data.more corrections.safetensors
 
-What the expert does is a demonstration (DAgger, Ross et al., 2011); what the model did is not. As in the training set, what a task
-does not need lies elsewhere in each picture.
+The expert's part is a demonstration (DAgger, Ross et al., 2011); the model's part is discarded. As in the training set, objects
+irrelevant to the task are elsewhere in each picture.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""Why episodes of pushing fail: the model alone, with either half done by the expert, and the expert behind the model's eyes.
+"""Causes of failed pushing episodes: the model alone, with either half by the expert, and the expert with the model's perception.
 
     python benchmarks/experiments/tabletop_failures.py --pretrained pretrained/tabletop --out results/tabletop_failures.json
     python benchmarks/experiments/tabletop_failures.py --concept concept.safetensors \

@@ -1,11 +1,11 @@
-"""Where a model's image encoder sees things on the table-top, so that a failure of plans can be told from one of seeing.
+"""Localisation error of a model's image encoder on the table-top, to distinguish failures of planning and of perception.
 
     python benchmarks/experiments/tabletop_localisation.py --pretrained pretrained/tabletop --out results/tabletop_localisation.json
 
-From the features of an image, linear regression (ridge) and a small network each estimate where every object is. They learn from
-new scenes of all tasks, and are tested on others; the encoder stays as it was trained. Errors are distances in centimetres, of
-circle and triangle apart for each surface that they lie on; `middle` is the error of always saying the mean place. An encoder that
-reads points also tells places itself (`read`).
+Linear regression (ridge) and a small network estimate the position of every object from the features of an image. They are trained
+on new scenes of all tasks and tested on others; the encoder stays fixed. Errors are distances in centimetres, for circle and
+triangle by the surface below them. `middle` is the error of the mean position. An encoder of points also has its direct estimate
+(`read`).
 """
 
 import argparse

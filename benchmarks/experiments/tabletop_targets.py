@@ -1,4 +1,4 @@
-"""Whether a push aims at what its concept says: two things lie equally far from the circle, then exchange their places.
+"""Test whether a push follows its concept: two objects at the same distance from the circle exchange their positions.
 
     python benchmarks/experiments/tabletop_targets.py --pretrained pretrained/tabletop_wide --out results/tabletop_targets.json
 

@@ -1,10 +1,10 @@
-"""How training concepts are learned in pretraining, run beside run, from what the runs logged.
+"""Plot the accuracy of training concepts over the steps of pretraining, for several runs, from their logs.
 
     python -m ftl_lightning fit --config conf/agent.yaml
     python -m ftl_lightning ablate --config conf/ablation/changes.yaml
     python benchmarks/experiments/training_curves.py --run ours logs/agent/fit --run "the paper's form" logs/changes/agent-paper0
 
-A run that was resumed is one curve.
+A resumed run is a single curve.
 """
 
 import argparse

@@ -1,6 +1,6 @@
-"""Freeze the suites of the benchmark: draw their data and write what they are known by into the suites' files.
+"""Freeze the suites of the benchmark: draw their data and write its hashes into the suites' files.
 
-A suite that has been published is never frozen again: a changed generator is a new suite.
+A published suite is never frozen again; a changed generator needs a new suite.
 
     python benchmarks/making/freeze_suites.py --suites beats pictures reaches strokes
     python benchmarks/making/freeze_suites.py --suites agent --parts demonstrations starts

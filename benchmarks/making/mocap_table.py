@@ -1,4 +1,4 @@
-"""The tables of human motion's page, from the rows of its ablation: results/mocap.md.
+"""Write the tables of the page on human motion, results/mocap.md, from the rows of its ablation.
 
     python benchmarks/making/mocap_table.py
 

@@ -1,4 +1,4 @@
-"""A film of the page of ``play``, as a person sees it: five strokes drawn, learned, and mixed by a slider.
+"""Record a film of the ``play`` page in a browser: five strokes are drawn, learned, and mixed by a slider.
 
     python benchmarks/making/play_film.py [--out docs/play.gif] [--pictures docs/play]
 

@@ -1,4 +1,4 @@
-"""Episodes of a task side by side from the same scenes: ours, fine-tuning, behaviour cloning and the expert.
+"""Make a film of episodes side by side from the same scenes: ours, fine-tuning, behaviour cloning and the expert.
 
     python benchmarks/making/tabletop_films.py --out docs/push_on_book.gif
 

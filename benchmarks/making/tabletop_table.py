@@ -1,4 +1,4 @@
-"""The tables of the table-top's page, from the rows of its ablations and its benchmarks: results/tabletop.md, tabletop_wide.md.
+"""Write the tables of the page on the table-top, results/tabletop.md and tabletop_wide.md, from its ablations and benchmarks.
 
     python benchmarks/making/tabletop_table.py
 

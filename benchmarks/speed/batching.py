@@ -1,4 +1,4 @@
-"""How many concepts a second are learned, of 1 to 256 that are learned together, with the settings that ship.
+"""Concepts learned per second, for 1 to 256 concepts learned together, with the shipped settings.
 
     python benchmarks/speed/batching.py [--domain object_rearrangement] [--most 256] [--out results/batching.json]
                                   [--precision bf16-mixed] [--processes 2]

@@ -1,4 +1,4 @@
-"""What a step costs: how it grows with horizon, K, width and number of concepts, and a model of its time from counted operations.
+"""Run time of a step by horizon, K, width and number of concepts, and a model of it from counted operations.
 
     python benchmarks/speed/cost.py [--out results/cost.json] [--kept logs/cost_steps.json] [--budget SECONDS] [--rounds 3]
 

@@ -1,7 +1,6 @@
-"""What a computation costs, counted while it runs: operations, bytes moved, calls, and what is kept for the backward pass.
+"""Count the operations, moved bytes, calls, and bytes saved for the backward pass of a computation.
 
-Operations are torch's own count (``FlopCounterMode``). Tensors on the meta device have no numbers, so that what no memory here
-holds can be counted too.
+Operations are torch's count (``FlopCounterMode``). On the meta device, computations that exceed the memory can be counted too.
 """
 
 from collections import Counter

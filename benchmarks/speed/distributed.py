@@ -1,4 +1,4 @@
-"""``fit`` in two processes beside one: losses of every domain and method, throughput, and what is left after a kill.
+"""Compare ``fit`` in two processes with a single process: losses of every domain and method, throughput, and resuming after a kill.
 
     python benchmarks/speed/distributed.py [--out results/distributed.json] [--mocap FOLDER] [--parts losses throughput kills]
 

@@ -1,4 +1,4 @@
-"""What bfloat16 and compiling do to ``fit``: seconds of a step, seconds until the first, and the loss, beside those of the default.
+"""Effect of bfloat16 and of compilation on ``fit``: seconds of a step, seconds until the first step, and the loss.
 
     python benchmarks/speed/fit_options.py [--out results/fit_options.json]
 

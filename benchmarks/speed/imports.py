@@ -1,12 +1,12 @@
-"""What starting costs: seconds, modules and the largest packages of each verb, alone on a quiet machine.
+"""Start-up cost of each verb: seconds, modules and the largest packages, measured on an idle machine.
 
     python benchmarks/speed/imports.py [--runs 5] [--out results/imports.json]
     python benchmarks/speed/imports.py --page  # writes the table in docs/speed.md from that file
 
-Each verb runs in a process of its own, some times after one that is not counted; the median counts. *Help* is all that
-``VERB --help`` takes. *Start* is what passes from the start of the process to the first step of learning, or to the end of verbs
-that learn nothing. *Imports* are the part of it that Python spends in importing modules, as ``-X importtime`` tells it, in runs of
-their own, which take a little longer for it; a package's seconds are those of its own modules, without what these import of others.
+Each verb runs in a separate process several times after a warm-up run; numbers are medians. *Help* is the time of ``VERB --help``.
+*Start* is the time from the start of the process to the first step of learning, or to the end of verbs without learning. *Imports*
+is its part for importing modules by ``-X importtime``, in separate, slightly slower runs. Seconds of a package are those of its
+modules without modules of other packages that they import.
 """
 
 import argparse

@@ -1,11 +1,11 @@
-"""From nothing to the first sample: an empty environment, torch, the wheel, and the program outside of the checkout.
+"""Time from an empty environment to the first sample: torch, the wheel, and the program outside of the checkout.
 
     python benchmarks/speed/install.py [--python python3.11 ...] [--out results/install.json]
 
-Builds the wheel, then for each interpreter: fills a cache of packages of its own, makes an environment without the system's
-packages, installs torch and the wheel in the versions of ``constraints.txt``, samples with a model that ships, and fits a small
-model with its evaluation. Torch comes from pip's index, or from ``--torch-index``. Needs the network, or an index that pip is
-configured with, and space for torch twice. Seconds are of this machine, whatever else runs on it.
+Builds the wheel, then for each interpreter: fills a separate package cache, creates an environment without the system's packages,
+installs torch and the wheel in the versions of ``constraints.txt``, samples with a shipped model, and fits and evaluates a small
+model. Torch is from pip's index, or from ``--torch-index``. Needs the network, or an index in pip's configuration, and space for
+two copies of torch. Seconds depend on the machine and its load.
 """
 
 import argparse

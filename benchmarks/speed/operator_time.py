@@ -1,8 +1,8 @@
-"""How long products and convolutions take by themselves, with tensors of given shapes.
+"""Run time of isolated products and convolutions by tensor shape.
 
-No formula tells it: libraries choose among routines by shape, and a convolution of four states of one window can take three times
-as long as one of sixteen. So each call of a shape is measured once, apart from the step that it is part of: with what it reads out
-of the processor's caches as far as the other weights of the step would have pushed it out, and with memory at hand, as in a step.
+There is no formula, as libraries choose routines by shape: a convolution over four states of a window can take three times as long
+as over sixteen. Each shape is measured once outside of its step. Before a call its inputs are evicted from the processor's caches
+as far as the other weights of the step would evict them; memory is allocated in advance, as in a step.
 """
 
 import ctypes

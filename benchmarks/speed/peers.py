@@ -1,4 +1,4 @@
-"""Inversion and sampling beside ``diffusers``: the same network, the same work, one run on one machine.
+"""Run time of inversion and sampling against ``diffusers`` with the same network and work, in a single run.
 
     python benchmarks/speed/peers.py [--pretrained pretrained/object_rearrangement] [--out results/peers.json] [--threads 2]
 
@@ -7,13 +7,13 @@ inversion (a table of embeddings of which all rows but the new ones are put back
 of all branches, in which every plan brings its own embedding. The network is ours with its weights. The loss is Eq. 2, so that both
 learn the same.
 
-As its examples do: one plan after another when a concept is looked at, and one noised demonstration at a time, accumulated, when
-one is learned. Batched by hand: all plans of a concept at once, or of all concepts, and all noised demonstrations of a step; for
-sampling also with what a concept makes computed once instead of for every plan, which takes a change of the network's interface.
+*One by one*, as in its examples: plans of a concept are sampled one after another, and learning accumulates gradients of single
+noised demonstrations. *Batched* by hand: all plans of a concept, or of all concepts, at once, and all noised demonstrations of a
+step; for sampling also with the concept's features computed once instead of for every plan, which changes the network's interface.
 
-The same noise gives the same plans with DDPM and DDIM; learned concepts have the same loss on common noise. Both are in the file.
-CleanDiffuser is not among Python's packages (no release on PyPI), so it is not compared. With one thread, seconds are of processor
-time, which other work disturbs less.
+Equal noise gives equal plans with DDPM and DDIM, and learned concepts have equal losses on common noise; both are in the file.
+CleanDiffuser is not compared, as it has no release on PyPI. With a single thread, seconds are of processor time, which depends less
+on other load.
 """
 
 import argparse

@@ -1,10 +1,10 @@
-"""The page of ``play`` used as a person uses it, timed: five strokes of new kinds drawn in a browser, learned, sampled, and mixed.
+"""Run time of the ``play`` page in a browser: draw five strokes of new kinds, learn, sample, and mix.
 
     python benchmarks/speed/play.py [--out results/play.json] [--kinds KIND ...]
 
-Chromium draws with a synthetic mouse. Each kind is one that pretraining does not show, in five strokes as a hand draws them
-(:mod:`ftl_lightning.apps.benchmark.strokes`). Samples are classified by nearest templates, independently of learning.
-Seconds are of this machine, whatever else runs on it.
+Chromium draws with a synthetic mouse. Each kind is absent from pretraining and has five hand-like strokes
+(:mod:`ftl_lightning.apps.benchmark.strokes`). Samples are classified by nearest templates, independently of learning. Seconds
+depend on the machine and its load.
 """
 
 import argparse

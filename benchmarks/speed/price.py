@@ -1,14 +1,14 @@
-"""Hours and money of every published configuration on three machines, from counted operations and what an H100 reached.
+"""Hours and price of every published configuration on three machines, from counted operations and the measured rate of an H100.
 
     python benchmarks/speed/price.py [--machines benchmarks/speed/machines.yaml] [--out results/price.json] \
         [--table results/price.md]
 
-The time of a step is the longest of three: operations over the rate that is reached, bytes over the memory's bandwidth, and calls
-times the time that a call takes. Rate and call come from the pretrainings of ``results/paper_size_runs.json``, on one H100: the
-rate from the compiled temporal U-Net (which ran beside two others, so that it is a lower bound), the time of a call from the one
-that was not compiled. The third, an MLP, is left out and tells the error. An A4000 is taken to reach the same share of its peak,
-and the same time of a call, which is the host's; eight H100s to share the windows of a step, with gradients passed twice over
-their link. Everything but the three rows is extrapolated.
+The time of a step is the maximum of three times: operations over the reached rate, bytes over the memory bandwidth, and calls times
+the overhead of a call. Rate and overhead are from the pretrainings of ``results/paper_size_runs.json`` on an H100: the rate from
+the compiled temporal U-Net (a lower bound, as two others ran beside it), the overhead from the uncompiled U-Net. The third run, an
+MLP, is held out and gives the error. An A4000 is assumed to reach the same share of its peak and the same overhead (the host's);
+eight H100s are assumed to share the windows of a step and to pass gradients twice over their link. All but the three rows is
+extrapolated.
 """
 
 import argparse

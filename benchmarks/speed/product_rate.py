@@ -1,10 +1,10 @@
-"""The share of the processor's rate of matrix products that inversion of ten concepts together, and sampling, reach.
+"""Share of the processor's matrix product rate that inversion of ten concepts and sampling reach.
 
     python benchmarks/speed/product_rate.py [--out results/product_rate.json]
 
-The rate is measured by ``torch.mm`` at the sizes that occur and at others; the best of all counts. Operations are torch's own
-count of the whole call, ``invert`` or ``sample``, with all that is not products in its time. Where the rest goes is told by
-operator, from a profile of the same call. Seconds are of processor time of one thread.
+The rate is the maximum of ``torch.mm`` over the sizes that occur and others. Operations are torch's count for the whole call of
+``invert`` or ``sample``, whose time includes everything besides products. A profile of the same call gives the remaining time by
+operator. Seconds are processor time of a single thread.
 """
 
 import argparse

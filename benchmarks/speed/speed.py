@@ -1,14 +1,14 @@
-"""Speed, each ratio measured in one run on this machine: inversion and sampling in batches against the published procedure.
+"""Speed-up of batched inversion and sampling over the published procedure, each ratio measured in a single run.
 
     python benchmarks/speed/speed.py [--pretrained pretrained/object_rearrangement] [--out results/speed.json] [--full]
 
-The published inversion takes one noised demonstration at a time, accumulates two, and evaluates the K + 1 branches one after
-another, for 5 x 10,000 optimiser steps a concept; a slice of its steps is timed and scaled up. What it has learned after so many
-steps is found by the same arithmetic for all concepts in a batch, outside the clock. ``--full`` also runs it to its end as it is
-published, for one concept, and takes the time of a step from that.
+The published inversion processes single noised demonstrations, accumulates two, and evaluates the K + 1 branches sequentially, for
+5 x 10,000 optimiser steps per concept. A slice of its steps is timed and scaled up. Its accuracy by number of steps is computed
+by the same arithmetic for all concepts in a batch, without timing. ``--full`` also runs it to its end for a single concept and
+takes the time of a step from that run.
 
-Ours learns with the shipped settings, each of nine concepts of the validation suite alone (the mean is told) and ten together.
-Accuracy is the mean over the nine: rings, of which one set of embeddings says too little, are not judged.
+Ours learns with the shipped settings: nine concepts of the validation suite one at a time (mean), and ten together. Accuracy is the
+mean over the nine; rings are excluded, as a single set of embeddings does not represent them.
 """
 
 import argparse
@@ -36,7 +36,7 @@ from ftl_lightning.igm.inversion import invert
 from ftl_lightning.igm.samplers import Sampling, ddpm
 from ftl_lightning.igm.settings import InversionSettings
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
-from ftl_lightning.reporting.speed import ONE, PUBLISHED, TEN, Measured, reached
+from ftl_lightning.reporting.measurements import ONE, PUBLISHED, TEN, Measured, reached
 from ftl_lightning.services.progress import bar
 from ftl_lightning.services.seeding import generator, task_key
 from ftl_lightning.services.tensor_file import write_text

@@ -1,5 +1,5 @@
-"""The tables of the page on speed, from what was measured: results/peers.md, batching.md, product_rate.md,
-cost.md and fit_options.md.
+"""Write the tables of the page on speed from the measurements: results/peers.md, batching.md, product_rate.md, cost.md and
+fit_options.md.
 
 python benchmarks/speed/speed_table.py
 """

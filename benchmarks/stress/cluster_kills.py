@@ -1,12 +1,12 @@
-"""Whether a grid on a Ray cluster loses or doubles rows when its processes, machines and head are killed.
+"""Test that a grid on a Ray cluster neither loses nor duplicates rows when its processes, nodes and head are killed.
 
     python benchmarks/stress/cluster_kills.py --count 20 --out results/cluster_kills.json
 
 Two nodes run on this machine, each with one processor. A grid of six inversions is run by `ablate --executor ray`, and while it
 runs, a process that runs a cell, the second node, or (every tenth time) the head with everything on it is killed at a random
-moment, and put up again. The same command is given until it ends well. Then the rows are compared with those of the same grid in
-one process that nothing disturbs; and so on with another grid, until there were so many kills. Each cell is the target of at most
-one kill for each time that it is run first.
+moment and restarted. The same command is repeated until it succeeds. Then the rows are compared with those of the same grid in a
+single undisturbed process. Grids follow each other until ``--count`` kills. Each cell is the target of at most a single kill for
+each time that it is run first.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""How damaged and hostile files are told: mutated files are read as users' files are, and what comes of each is counted.
+"""Fuzz the readers of files: read mutated files like users' files, and count the outcomes.
 
     python benchmarks/stress/fuzz.py --kind config.json --count 1000 --seed 0
 

@@ -1,4 +1,4 @@
-"""Whether a checkpoint is left whole by kills and by a disk that is full, and whether training goes on from it.
+"""Test that checkpoints survive kills and a full disk, and that training resumes from them.
 
     python benchmarks/stress/kills.py --folder FOLDER --count 20
 

@@ -60,11 +60,11 @@ def check(options: CheckOptions) -> None:
         for text_line in str(checks[-1]).splitlines():
             say(f"{text_line[: len(text_line) - len(text_line.lstrip())]}{line(text_line)}")
     if options.figure:
-        from ftl_lightning.reporting.check_figure import picture
+        from ftl_lightning.reporting.concept_figures import check_figure
         from ftl_lightning.services.tensor_file import atomic
 
         with atomic(options.figure) as temporary:
-            picture(checks).savefig(temporary, dpi=110)
+            check_figure(checks).savefig(temporary, dpi=110)
         say(options.figure)
 
 

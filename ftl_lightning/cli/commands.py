@@ -173,7 +173,7 @@ def report(results: str = "results", out: str = "results/report", readme: str = 
         html: HTML file to write instead: overview, films, concepts and curves, without a network.
     """
     if html:
-        from ftl_lightning.reporting.html.page import write_page
+        from ftl_lightning.reporting.page import write_page
 
         say(f"{html}: {write_page(Path(results), Path(html)) / 1e6:.1f} MB")
         return

@@ -1,4 +1,4 @@
-"""Forward process, samplers, and denoisers for configurations."""
+"""Denoisers by their names in configurations, encoders of conditions and images, and text encoders."""
 
 from ftl_lightning.networks.mlp import MLPDenoiser
 from ftl_lightning.networks.temporal_unet import TemporalUNet

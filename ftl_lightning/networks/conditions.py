@@ -1,19 +1,92 @@
-"""Condition encoders of observed features.
+"""Inputs of denoisers: the domain's sizes, the timestep embedding, and condition encoders of observed features.
 
-Each encoder has two halves: ``observe`` reads the features once per plan, ``attend`` adds the concept at every denoising step.
+Each condition encoder has two halves: ``observe`` reads the features once per plan, ``attend`` adds the concept at every denoising
+step.
 """
 
+import itertools
+import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from ftl_lightning.data.features import Feature
 from ftl_lightning.igm.diffusion import Context
-from ftl_lightning.networks.denoiser import Sizes
 from ftl_lightning.networks.image_encoder import POINT
-from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.errors import require, shown
+
+CHOSEN = 4
+"""Number of image points that a concept chooses."""
+SHARPNESS = 4.0
+"""Inverse temperature of a choice; a mean of several points is the position of none."""
+SMALLEST = 0.02
+"""Length of a vector below which its direction is scaled down."""
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Sizes of a domain, the first argument of every denoiser.
+
+    Attributes:
+        horizon: number of states in a plan.
+        state_dim: columns of a state.
+        concept_dim: columns of a concept embedding.
+        observed: features that condition the denoiser, by name; may be empty.
+        image_dim: number of features of the observed images, which follow the observed vectors.
+        plane: columns of a state with x and y in the coordinates of image points.
+    """
+
+    horizon: int
+    state_dim: int
+    concept_dim: int
+    observed: Mapping[str, Feature] = field(default_factory=dict)
+    image_dim: int = 0
+    plane: tuple[int, ...] = ()
+
+    @property
+    def columns(self) -> dict[str, slice]:
+        """Input columns of each observed vector, by name."""
+        vectors = {name: feature.size for name, feature in self.observed.items() if feature.kind == "vector"}
+        starts = itertools.accumulate(vectors.values(), initial=0)
+        return {name: slice(start, start + size) for (name, size), start in zip(vectors.items(), starts, strict=False)}
+
+    @property
+    def measured_dim(self) -> int:
+        """Number of columns of the concatenated observed vectors."""
+        return max((columns.stop for columns in self.columns.values()), default=0)
+
+    @property
+    def vector_dim(self) -> int:
+        """Number of input columns: observed vectors and image features."""
+        return self.measured_dim + self.image_dim
+
+    @property
+    def entities(self) -> tuple[tuple[int, ...], ...]:
+        """Input columns of each exchangeable entity."""
+        placed = [(columns.start, self.observed[name]) for name, columns in self.columns.items()]
+        return tuple(tuple(start + column for column in entity) for start, feature in placed for entity in feature.entities)
+
+    @property
+    def attributes(self) -> tuple[int, ...]:
+        """Attribute columns of an entity, relative to its first, to which concepts refer; empty for all."""
+        return next((self.observed[name].attributes for name in self.columns if self.observed[name].attributes), ())
+
+    @property
+    def state_columns(self) -> tuple[int, ...]:
+        """Columns of the observed vectors with the plan's initial state; may be empty."""
+        return tuple(columns.start + column for name, columns in self.columns.items() for column in self.observed[name].state)
+
+
+def sinusoidal_embedding(t: Tensor, dimension: int, period: float = 10_000.0) -> Tensor:
+    """Sinusoidal features ``(batch, dimension)`` of timestep ``t (batch,)`` (Vaswani et al., 2017); ``dimension`` is even."""
+    half = dimension // 2
+    frequency = torch.exp(torch.arange(half, device=t.device) * (-math.log(period) / (half - 1)))
+    angle = t[:, None] * frequency
+    return torch.cat((angle.sin(), angle.cos()), dim=-1)
 
 
 class ConditionEncoder(nn.Module, ABC):
@@ -23,13 +96,17 @@ class ConditionEncoder(nn.Module, ABC):
     def observe(self, vector: Tensor) -> Context:
         """Encode the concatenated, normalised observed vectors ``(batch, m)`` independently of the concept."""
 
-    @abstractmethod
     def attend(self, context: Context, concept: Tensor) -> Tensor:
-        """Features ``(batch, width)`` of a context for ``concept (batch, n)``."""
+        """Features ``(batch, width)`` of a context for ``concept (batch, n)``; by default the first value of ``observe``."""
+        return context[0]
 
     def direction(self, context: Context, concept: Tensor) -> Tensor | None:
         """Unit vector ``(batch, 2)`` of the plan's x axis; ``None`` for unrotated plans."""
         return None
+
+
+def _mlp(inputs: int, width: int) -> nn.Sequential:
+    return nn.Sequential(nn.Linear(inputs, 4 * width), nn.Mish(), nn.Linear(4 * width, width))
 
 
 class FlatEncoder(ConditionEncoder):
@@ -42,13 +119,10 @@ class FlatEncoder(ConditionEncoder):
 
     def __init__(self, sizes: Sizes, width: int) -> None:
         super().__init__()
-        self.net = nn.Sequential(nn.Linear(sizes.vector_dim, 4 * width), nn.Mish(), nn.Linear(4 * width, width))
+        self.net = _mlp(sizes.vector_dim, width)
 
     def observe(self, vector: Tensor) -> Context:
         return (self.net(vector),)
-
-    def attend(self, context: Context, concept: Tensor) -> Tensor:
-        return context[0]
 
 
 class JointEncoder(ConditionEncoder):
@@ -61,8 +135,7 @@ class JointEncoder(ConditionEncoder):
 
     def __init__(self, sizes: Sizes, width: int) -> None:
         super().__init__()
-        inputs = sizes.vector_dim + sizes.concept_dim
-        self.net = nn.Sequential(nn.Linear(inputs, 4 * width), nn.Mish(), nn.Linear(4 * width, width))
+        self.net = _mlp(sizes.vector_dim + sizes.concept_dim, width)
 
     def observe(self, vector: Tensor) -> Context:
         return (vector,)
@@ -72,24 +145,45 @@ class JointEncoder(ConditionEncoder):
         return features
 
 
-def _entity_columns(name: str, sizes: Sizes) -> tuple[Tensor, Tensor]:
-    """Columns of each entity ``(entity, columns)`` and the columns of no entity."""
-    if not sizes.entities:
-        raise UserError(f"denoiser_args.initial_encoder: expected flat, found {name}: this domain does not name its entities")
-    columns = torch.tensor(sizes.entities)
-    used = {column for entity in sizes.entities for column in entity}
-    # One-hot entity types would break the symmetry, but they are constant, and constant columns are normalised to 0.
-    shared = [column for column in range(sizes.vector_dim) if column not in used]
-    return columns, torch.tensor(shared, dtype=torch.int64)
+class _Entities(ConditionEncoder):
+    """Base class of encoders of exchangeable entities.
+
+    Columns that belong to no entity are appended to every entity and to the features.
+    """
+
+    columns: Tensor
+    """Columns of each entity ``(entity, column)``."""
+    shared: Tensor
+    """Columns that belong to no entity."""
+    entity: nn.Sequential
+
+    def __init__(self, name: str, sizes: Sizes) -> None:
+        super().__init__()
+        found = f"{name}: this domain does not name its entities"
+        require(sizes.entities, "denoiser_args.initial_encoder", "flat", found)
+        used = {column for entity in sizes.entities for column in entity}
+        # One-hot entity types would break the symmetry, but they are constant, and constant columns are normalised to 0.
+        shared = [column for column in range(sizes.vector_dim) if column not in used]
+        self.register_buffer("columns", torch.tensor(sizes.entities), persistent=False)
+        self.register_buffer("shared", torch.tensor(shared, dtype=torch.int64), persistent=False)
+
+    def _build(self, inputs: int, inner: int) -> None:
+        inputs += len(self.shared)
+        self.entity = nn.Sequential(nn.Linear(inputs, inner), nn.Mish(), nn.Linear(inner, inner), nn.Mish())
+
+    def _hidden(self, each: Tensor, shared: Tensor) -> Tensor:
+        """Features ``(batch, entity, inner)`` of entities ``(batch, entity, column)`` and the other columns ``(batch, column)``."""
+        hidden: Tensor = self.entity(torch.cat((each, shared[:, None].expand(-1, each.shape[1], -1)), dim=-1))
+        return hidden
 
 
-class EntityEncoder(ConditionEncoder):
+class EntityEncoder(_Entities):
     """Attention over entities: the concept attends to their attributes, not to their positions.
 
-    The concept determines a weight for each attribute column, and the weighted sum is the attention logit of an entity: the weights
-    for red and for bowl add up to an unseen red bowl. There is a single head: several heads can disagree about the target, which
-    traps concepts learned through them. The values exclude the attributes, so a red bowl is reached like any other. The encoder is
-    invariant to exchanging entities. Columns of no entity are appended to every entity and to the features.
+    The concept determines a weight for each attribute column. The attention logit of an entity is the weighted sum of its
+    attributes, so the weights for *red* and for *bowl* add up to those of an unseen red bowl. The values exclude the attributes, so
+    a red bowl is approached like any other object. There is a single head: several heads can disagree about the target,
+    which traps concepts learned through them. The encoder is invariant to exchanging entities.
 
     Args:
         sizes: sizes of the observed vectors and their entities. Attribute columns are keys only; without named attributes all
@@ -97,35 +191,27 @@ class EntityEncoder(ConditionEncoder):
         width: number of features.
     """
 
-    columns: Tensor
-    shared: Tensor
-
     def __init__(self, sizes: Sizes, width: int) -> None:
-        super().__init__()
-        columns, shared = _entity_columns("entities", sizes)
-        self.attributes = list(sizes.attributes or range(columns.shape[1]))
-        self.rest = [column for column in range(columns.shape[1]) if column not in sizes.attributes]
-        self.register_buffer("columns", columns, persistent=False)
-        self.register_buffer("shared", shared, persistent=False)
+        super().__init__("entities", sizes)
+        self.attributes = list(sizes.attributes or range(self.columns.shape[1]))
+        self.rest = [column for column in range(self.columns.shape[1]) if column not in sizes.attributes]
         inner = 2 * width
-        self.entity = nn.Sequential(nn.Linear(len(self.rest) + len(shared), inner), nn.Mish(), nn.Linear(inner, inner), nn.Mish())
-        # Saturated attention on the wrong entity gets stuck: start with small weights and scale the concept to norm 1, so that a
-        # step of Adam changes the query a little (at the original norm of 20 it would flip the query).
+        self._build(len(self.rest), inner)
+        # Saturated attention to a wrong entity has hardly any gradient. Weights start small, and the concept is scaled to norm 1,
+        # so that a step of Adam changes the query a little; at the original norm of 20 it would reverse the query.
         self.query = nn.Linear(sizes.concept_dim, len(self.attributes))
         if not self.query.weight.is_meta:  # on the meta device torch would import its compiler
             nn.init.normal_(self.query.weight, std=0.2)
         self.value = nn.Linear(inner + len(self.rest), inner)
-        self.out = nn.Sequential(nn.Linear(inner + len(shared), inner), nn.Mish(), nn.Linear(inner, width))
+        self.out = nn.Sequential(nn.Linear(inner + len(self.shared), inner), nn.Mish(), nn.Linear(inner, width))
         # Linear path for the position of the attended entity, where a plan ends.
-        self.direct = nn.Linear(inner + len(shared), width)
+        self.direct = nn.Linear(inner + len(self.shared), width)
 
     def observe(self, vector: Tensor) -> Context:
         """Keys (attributes) and values of the entities, and the columns of no entity."""
-        shared = vector[:, self.shared]
-        each = vector[:, self.columns]  # (batch, entity, columns)
+        shared, each = vector[:, self.shared], vector[:, self.columns]
         rest = each[..., self.rest]
-        hidden = self.entity(torch.cat((rest, shared[:, None].expand(-1, each.shape[1], -1)), dim=-1))
-        return each[..., self.attributes], self.value(torch.cat((hidden, rest), dim=-1)), shared
+        return each[..., self.attributes], self.value(torch.cat((self._hidden(rest, shared), rest), dim=-1)), shared
 
     def attend(self, context: Context, concept: Tensor) -> Tensor:
         attributes, value, shared = context
@@ -136,46 +222,34 @@ class EntityEncoder(ConditionEncoder):
         return features
 
 
-class SetEncoder(ConditionEncoder):
+class SetEncoder(_Entities):
     """Max and mean pooling over the features of entities (deep sets, Zaheer et al., 2017), independent of the concept.
-
-    Columns of no entity are appended to every entity and to the features.
 
     Args:
         sizes: sizes of the observed vectors and their entities.
         width: number of features.
     """
 
-    columns: Tensor
-    shared: Tensor
-
     def __init__(self, sizes: Sizes, width: int) -> None:
-        super().__init__()
-        columns, shared = _entity_columns("set", sizes)
-        self.register_buffer("columns", columns, persistent=False)
-        self.register_buffer("shared", shared, persistent=False)
+        super().__init__("set", sizes)
         inner = 2 * width
-        self.entity = nn.Sequential(nn.Linear(columns.shape[1] + len(shared), inner), nn.Mish(), nn.Linear(inner, inner), nn.Mish())
-        self.out = nn.Sequential(nn.Linear(2 * inner + len(shared), inner), nn.Mish(), nn.Linear(inner, width))
+        self._build(self.columns.shape[1], inner)
+        self.out = nn.Sequential(nn.Linear(2 * inner + len(self.shared), inner), nn.Mish(), nn.Linear(inner, width))
 
     def observe(self, vector: Tensor) -> Context:
         shared = vector[:, self.shared]
-        each = vector[:, self.columns]  # (batch, entity, columns)
-        hidden = self.entity(torch.cat((each, shared[:, None].expand(-1, each.shape[1], -1)), dim=-1))
+        hidden = self._hidden(vector[:, self.columns], shared)
         return (self.out(torch.cat((hidden.amax(dim=1), hidden.mean(dim=1), shared), dim=-1)),)
-
-    def attend(self, context: Context, concept: Tensor) -> Tensor:
-        return context[0]
 
 
 class PointEncoder(ConditionEncoder):
     """Attention over image points: the concept chooses points and reads their positions relative to each other and to the origin.
 
-    Each of :data:`CHOSEN` choices is a mean of the visible points. Its weights depend on the concept alone (attention whose keys
-    are the points' numbers), so the same plan may refer to different objects. The inputs for every chosen point, and for every
-    difference between two, are the vector, its direction and the logarithm of its length, as near and far differ in scale. All
-    points are additional inputs. If plans have a plane, all vectors and the plan are rotated into the direction from the first
-    chosen point to the second: the encoder is equivariant to rotation.
+    Each of :data:`CHOSEN` choices is a weighted mean of the visible points. The weights depend on the concept alone (attention with
+    point indices as keys), so different concepts apply the same plan to different objects. Features of every chosen point, and of
+    every difference between two, are the vector, its direction and the logarithm of its length, which resolves near and far. The
+    coordinates of all points are additional features. If plans have a plane, all vectors and the plan are rotated into the
+    direction from the first chosen point to the second, so the encoder is equivariant to rotation.
 
     Args:
         sizes: sizes with the number of image features, which must be points.
@@ -187,8 +261,8 @@ class PointEncoder(ConditionEncoder):
 
     def __init__(self, sizes: Sizes, width: int) -> None:
         super().__init__()
-        if not sizes.image_dim or sizes.image_dim % POINT:
-            raise UserError("denoiser_args.initial_encoder: expected flat, found points: no points are read of images")
+        has_points = sizes.image_dim > 0 and sizes.image_dim % POINT == 0
+        require(has_points, "denoiser_args.initial_encoder", "flat", "points: no points are read of images")
         self.count, self.turns = sizes.image_dim // POINT, bool(sizes.plane)
         self.choice = nn.Linear(sizes.concept_dim, CHOSEN * self.count)
         with torch.no_grad():  # every choice starts with a different preferred point
@@ -197,7 +271,7 @@ class PointEncoder(ConditionEncoder):
             self.choice.bias.copy_(favourites.flatten())
         vectors = CHOSEN * (CHOSEN + 1) // 2
         inputs = sizes.measured_dim + 5 * vectors + 2 * CHOSEN + POINT * self.count
-        self.net = nn.Sequential(nn.Linear(inputs, 4 * width), nn.Mish(), nn.Linear(4 * width, width))
+        self.net = _mlp(inputs, width)
 
     def observe(self, vector: Tensor) -> Context:
         """Measured vectors, and x, y, height and visibility of each point ``(batch, point, 4)``."""
@@ -235,14 +309,6 @@ class PointEncoder(ConditionEncoder):
         return features
 
 
-CHOSEN = 4
-"""Number of points that a concept chooses."""
-SHARPNESS = 4.0
-"""Inverse temperature of a choice: the mean of several points is at none of them."""
-SMALLEST = 0.02
-"""Length of a vector below which its direction is scaled down."""
-
-
 def turned(values: Tensor, direction: Tensor, plane: Sequence[int], back: bool) -> Tensor:
     """Rotate vectors into the frame whose x axis is a direction, or back.
 
@@ -276,6 +342,5 @@ def condition_encoder(name: str, sizes: Sizes, width: int) -> ConditionEncoder |
     Raises:
         UserError: for an unknown name, or an encoder of entities in a domain without entities.
     """
-    if name not in ENCODERS:
-        raise UserError(f"denoiser_args.initial_encoder: expected one of {', '.join(ENCODERS)}, found {name!r}")
+    require(name in ENCODERS, "denoiser_args.initial_encoder", f"one of {', '.join(ENCODERS)}", shown(name))
     return ENCODERS[name](sizes, width) if sizes.vector_dim else None

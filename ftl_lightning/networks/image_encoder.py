@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -10,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ftl_lightning.data.features import Feature, Observed
-from ftl_lightning.services.errors import UserError, short, shown
+from ftl_lightning.services.errors import require, shown
 from ftl_lightning.services.processes import drawn
 from ftl_lightning.services.ranges import check_range
 from ftl_lightning.services.schema import from_mapping
@@ -72,46 +73,6 @@ class SpatialSoftmax(nn.Module):
         share = maps.softmax(dim=-1)
         column, row = (share @ grid).unbind(dim=-1)  # a single product: sums over large maps dominate the time
         return torch.cat((column, row, (share * maps).sum(dim=-1).tanh()), dim=-1)
-
-
-class Points(nn.Module):
-    """Locations of objects from all keypoints; pretraining defines the objects (``model.privileged``).
-
-    Args:
-        channels: channels of the feature map.
-        keypoints: number of keypoints.
-        points: number of objects.
-    """
-
-    def __init__(self, channels: int, keypoints: int, points: int) -> None:
-        super().__init__()
-        self.keypoints = SpatialSoftmax(channels, keypoints)
-        self.read = nn.Linear(3 * keypoints, POINT * points)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """``(batch, channels, height, width)`` to x, y, height and visibility logit, all x first: ``(batch, 4 * points)``."""
-        out: Tensor = self.read(self.keypoints(x))
-        return out
-
-
-class Grid(nn.Module):
-    """Flattened feature map with fewer channels.
-
-    Args:
-        channels: channels of the feature map.
-        kept: channels of the output.
-        height, width: size of the feature map.
-    """
-
-    def __init__(self, channels: int, kept: int, height: int, width: int) -> None:
-        super().__init__()
-        self.kept = nn.Conv2d(channels, kept, 1)
-        self.size = kept * height * width
-
-    def forward(self, x: Tensor) -> Tensor:
-        """``(batch, channels, height, width)`` to ``(batch, size)``."""
-        out: Tensor = self.kept(x).flatten(1)
-        return out
 
 
 def _small(channels: int, widths: Sequence[int], stride: int, height: int, width: int) -> tuple[nn.Module, tuple[int, int, int]]:
@@ -180,45 +141,40 @@ class ImageEncoder(nn.Module):
         origin: str = "",
     ) -> None:
         super().__init__()
-        for name, value, known in (("network", network, NETWORKS), ("head", head, HEADS)):
-            if value not in known:
-                raise UserError(f"model.image_encoder.{name}: expected one of {', '.join(known)}, found {value!r}")
-        if not widths or any(width < GROUPS or width % GROUPS for width in widths):
-            raise UserError(f"model.image_encoder.widths: expected multiples of {GROUPS}, found {list(widths)}")
-        if stride not in STRIDES:
-            raise UserError(f"model.image_encoder.stride: expected one of {', '.join(map(str, STRIDES))}, found {stride!r}")
-        if len(shape) != 3 or not 0 < math.prod(shape) <= MOST_PIXELS:
-            raise UserError(f"key 'observed': expected images of shape (channels, height, width), found {shown(tuple(shape))}")
+        key = "model.image_encoder"
+        for name, value, known in (("network", network, NETWORKS), ("head", head, HEADS), ("stride", stride, STRIDES)):
+            require(value in known, f"{key}.{name}", f"one of {', '.join(map(str, known))}", shown(value))
+        valid = bool(widths) and all(width >= GROUPS and width % GROUPS == 0 for width in widths)
+        require(valid, f"{key}.widths", f"multiples of {GROUPS}", list(widths))
+        is_image = len(shape) == 3 and 0 < math.prod(shape) <= MOST_PIXELS
+        require(is_image, "key 'observed'", "images of shape (channels, height, width)", tuple(shape))
         channels, height, width = shape
-        check_range("model.image_encoder.keypoints", keypoints, 1)
-        check_range("model.image_encoder.crop", crop, 0, min(height, width) - 1)
-        if (points > 0) != (head == POINTS):
-            raise UserError(
-                f"model.image_encoder.points: expected {'1 or more' if head == POINTS else 0} for {head}, found {points}"
-            )
-        check_range("model.image_encoder.points", points, 0, MOST_POINTS)
-        if origin and head == GRID:
-            raise UserError(f"model.image_encoder.origin: expected none for a head without keypoints, found {origin!r}")
+        check_range(f"{key}.keypoints", keypoints, 1)
+        check_range(f"{key}.crop", crop, 0, min(height, width) - 1)
+        count = "1 or more" if head == POINTS else "0"
+        require((points > 0) == (head == POINTS), f"{key}.points", f"{count} for {head}", points)
+        check_range(f"{key}.points", points, 0, MOST_POINTS)
+        require(not origin or head != GRID, f"{key}.origin", "none for a head without keypoints", shown(origin))
         self.crop, self.origin = crop, origin
         height, width = height - crop, width - crop
-        if network == "small" and min(height, width) < 2 * stride:
-            raise UserError(
-                f"model.image_encoder.crop: expected images of {2 * stride} x {2 * stride} or more for the small network, "
-                f"found {height} x {width}"
-            )
         if network == RESNET18:
             self.network: nn.Module = _ResNet18(channels)
-            size = (512, -(-height // 32), -(-width // 32))
+            maps = (512, -(-height // 32), -(-width // 32))
         else:
-            self.network, size = _small(channels, widths, stride, height, width)
-        if head == KEYPOINTS:
-            self.head: nn.Module = SpatialSoftmax(size[0], keypoints)
-            self.size = 3 * keypoints
+            least = f"images of {2 * stride} x {2 * stride} or more for the small network"
+            require(min(height, width) >= 2 * stride, f"{key}.crop", least, f"{height} x {width}")
+            self.network, maps = _small(channels, widths, stride, height, width)
+        self.head: nn.Module
+        self.values = POINT if head == POINTS else 3
+        """Values per keypoint or point."""
+        if head == GRID:
+            self.head, self.size = nn.Sequential(nn.Conv2d(maps[0], keypoints, 1), nn.Flatten()), keypoints * maps[1] * maps[2]
         elif head == POINTS:
-            self.head, self.size = Points(size[0], keypoints, points), POINT * points
+            self.size = POINT * points
+            parts = OrderedDict(keypoints=SpatialSoftmax(maps[0], keypoints), read=nn.Linear(3 * keypoints, self.size))
+            self.head = nn.Sequential(parts)
         else:
-            grid = Grid(size[0], keypoints, *size[1:])
-            self.head, self.size = grid, grid.size
+            self.head, self.size = SpatialSoftmax(maps[0], keypoints), 3 * keypoints
         """Number of features."""
 
     def forward(self, images: Tensor) -> Tensor:
@@ -253,11 +209,10 @@ class ImageEncoders(nn.Module):
         self.names = [name for name, feature in observed.items() if feature.kind == "image"]
         encoders = [from_mapping(ImageEncoder, arguments, "model.image_encoder", observed[name].shape) for name in self.names]
         self.origins = [encoder.origin for encoder in encoders]
-        self.columns = [POINT if isinstance(encoder.head, Points) else 3 for encoder in encoders]
-        """Values per keypoint or point."""
-        for origin in self.origins:
-            if origin and (origin not in observed or observed[origin].shape != (2,)):
-                raise UserError(f"model.image_encoder.origin: expected an observed vector of 2 columns, found {short(origin)!r}")
+        self.values = [encoder.values for encoder in encoders]
+        for origin in filter(None, self.origins):
+            is_point = origin in observed and observed[origin].shape == (2,)
+            require(is_point, "model.image_encoder.origin", "an observed vector of 2 columns", shown(origin))
         self.encoders = nn.ModuleList(encoders)
         self.sizes = [encoder.size for encoder in encoders]
         self.size = sum(self.sizes)
@@ -275,9 +230,9 @@ class ImageEncoders(nn.Module):
             observed: vectors by name, including the current origins.
         """
         parts = []
-        for part, origin, columns in zip(read.split(self.sizes, dim=1), self.origins, self.columns, strict=True):
+        for part, origin, values in zip(read.split(self.sizes, dim=1), self.origins, self.values, strict=True):
             if origin:
-                count = part.shape[1] // columns
+                count = part.shape[1] // values
                 places, rest = part[:, : 2 * count], part[:, 2 * count :]
                 part = torch.cat((places - observed[origin].repeat_interleave(count, dim=1), rest), dim=1)
             parts.append(part)

@@ -7,9 +7,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ftl_lightning.igm.diffusion import Context
-from ftl_lightning.networks.conditions import condition_encoder, turned
-from ftl_lightning.networks.denoiser import Sizes, sinusoidal_embedding
-from ftl_lightning.services.errors import UserError
+from ftl_lightning.networks.conditions import Sizes, condition_encoder, sinusoidal_embedding, turned
+from ftl_lightning.services.errors import require
 from ftl_lightning.services.processes import Dropout
 from ftl_lightning.services.ranges import check_range
 
@@ -52,14 +51,9 @@ class MLPDenoiser(nn.Module):
         initial_dim: int = 64,
     ) -> None:
         super().__init__()
-        if time_dim < 4 or time_dim % 2:
-            raise UserError(f"denoiser_args.time_dim: expected an even number from 4 up, found {time_dim}")
-        for name, value in (
-            ("hidden_dim", hidden_dim),
-            ("depth", depth),
-            ("condition_dim", condition_dim),
-            ("initial_dim", initial_dim),
-        ):
+        require(time_dim >= 4 and time_dim % 2 == 0, "denoiser_args.time_dim", "an even number from 4 up", time_dim)
+        counts = {"hidden_dim": hidden_dim, "depth": depth, "condition_dim": condition_dim, "initial_dim": initial_dim}
+        for name, value in counts.items():
             check_range(f"denoiser_args.{name}", value, 1)
         check_range("denoiser_args.dropout", dropout, 0, 1)
         self.time_dim, self.plane = time_dim, sizes.plane

@@ -9,9 +9,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ftl_lightning.igm.diffusion import Context
-from ftl_lightning.networks.conditions import condition_encoder
-from ftl_lightning.networks.denoiser import Sizes, sinusoidal_embedding
-from ftl_lightning.services.errors import UserError
+from ftl_lightning.networks.conditions import Sizes, condition_encoder, sinusoidal_embedding
+from ftl_lightning.services.errors import require
 
 MOST_CLOCK = 256
 """Maximum number of position channels: single precision does not resolve higher frequencies."""
@@ -68,11 +67,6 @@ class ResidualBlock(nn.Module):
         return out
 
 
-def _bias(layer: nn.Conv1d) -> Tensor:
-    assert layer.bias is not None
-    return layer.bias
-
-
 class Level(nn.Module):
     """Two residual blocks at the same resolution; arguments as in :class:`ResidualBlock`."""
 
@@ -125,16 +119,15 @@ class TemporalUNet(nn.Module):
         smooth: int = 0,
     ) -> None:
         super().__init__()
-        factor = 2 ** (len(multipliers) - 1)
-        if sizes.horizon % factor:
-            halvings = len(multipliers) - 1
-            raise UserError(
-                f"horizon: expected a multiple of {factor} (the temporal U-Net halves it {halvings} times), found {sizes.horizon}"
-            )
-        if width < GROUPS or width % GROUPS:
-            raise UserError(f"denoiser_args.width: expected a multiple of {GROUPS}, found {width}")
-        if clock % 2 or not 0 <= clock <= MOST_CLOCK:
-            raise UserError(f"denoiser_args.clock: expected an even number up to {MOST_CLOCK}, found {clock}")
+        halvings = len(multipliers) - 1
+        factor = 2**halvings
+        expected = f"a multiple of {factor} (the temporal U-Net halves it {halvings} times)"
+        require(sizes.horizon % factor == 0, "horizon", expected, sizes.horizon)
+        require(width >= GROUPS and width % GROUPS == 0, "denoiser_args.width", f"a multiple of {GROUPS}", width)
+        is_clock = clock % 2 == 0 and 0 <= clock <= MOST_CLOCK
+        require(is_clock, "denoiser_args.clock", f"an even number up to {MOST_CLOCK}", clock)
+        expected = "points without a plane for TemporalUNet, which turns no plans"
+        require(initial_encoder != "points" or not sizes.plane, "denoiser_args.initial_encoder", expected, "points with a plane")
         self.smooth = smooth
         self.width, self.broadcast = width, broadcast and sizes.vector_dim > 0
         # Explicit CPU: arithmetic on the meta device makes torch import its compiler.
@@ -143,8 +136,6 @@ class TemporalUNet(nn.Module):
         self.register_buffer("clock", torch.cat((angle.sin(), angle.cos())), persistent=False)
         self.time = nn.Sequential(nn.Linear(width, 4 * width), nn.Mish(), nn.Linear(4 * width, width))
         self.concept = nn.Sequential(nn.Linear(sizes.concept_dim, 4 * width), nn.Mish(), nn.Linear(4 * width, width))
-        if initial_encoder == "points" and sizes.plane:
-            raise UserError("denoiser_args.initial_encoder: expected points without a plane for TemporalUNet, which turns no plans")
         self.initial = condition_encoder(initial_encoder, sizes, width)
         condition = width * (3 if sizes.vector_dim else 2)
         channels = [width * multiplier for multiplier in multipliers]
@@ -161,8 +152,8 @@ class TemporalUNet(nn.Module):
         self.out = nn.Sequential(_convolution(width, width), nn.Conv1d(width, sizes.state_dim, 1))
         self.skip = nn.Conv1d(width, width, 1) if skip else None
         if self.skip is not None:
-            nn.init.zeros_(self.skip.weight)
-            nn.init.zeros_(_bias(self.skip))
+            for parameter in self.skip.parameters():
+                nn.init.zeros_(parameter)
 
     def observe(self, vector: Tensor | None) -> Context:
         """Encode the normalised observed vectors ``(batch, m)`` once per plan; empty without vectors."""

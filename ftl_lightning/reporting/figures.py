@@ -1,33 +1,47 @@
 """Figures from results."""
 
 import textwrap
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Iterable, Mapping, Sequence, Set
 
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from ftl_lightning.domains.comparison import CHOSEN, OURS, Compared
+from ftl_lightning.domains.comparison import CHOSEN, FINE_TUNED, OURS, PAPERS_METHOD, WITH_ADAPTER, WITH_KNOTS, WITH_MODES, Compared
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.evaluation.references import FRESH, REPLAYED
 from ftl_lightning.evaluation.results import latest
 from ftl_lightning.evaluation.row import REFERENCE
 from ftl_lightning.evaluation.row import label as method_label
-from ftl_lightning.igm.concept import Concept
-from ftl_lightning.reporting.colours import COLOURS, colours
-from ftl_lightning.reporting.colours import PAPER as PAPER_COLOUR
 from ftl_lightning.reporting.comparison import compared, methods, reference_lines, shown_lines
-from ftl_lightning.reporting.concept_places import concept_places
-from ftl_lightning.reporting.curves import AXES, points
-from ftl_lightning.reporting.frontier import NOISY
-from ftl_lightning.reporting.shown import lookup, main_omega, settings
-from ftl_lightning.reporting.speed import Measured, reached
-from ftl_lightning.reporting.table import of_method, select, summarise
-from ftl_lightning.reporting.tables import labelled, main_rows
+from ftl_lightning.reporting.measurements import NOISY, Measured, reached
+from ftl_lightning.reporting.table import lookup, main_omega, of_method, select, settings, summarise
+from ftl_lightning.reporting.tables import AXES, labelled, main_rows, points
 from ftl_lightning.services.escape import figure_text
-from ftl_lightning.training.concept_model import ConceptModel
 
+_MODES_OVER_TIME = f"{WITH_MODES} {WITH_KNOTS}"
+OF_METHODS: Mapping[Compared, str] = {
+    PAPERS_METHOD: "#0072b2",
+    Compared(OURS, CHOSEN): "#56b4e9",
+    Compared(OURS, f"{WITH_KNOTS} {CHOSEN}"): "#56b4e9",
+    Compared(OURS, WITH_MODES): "#44aa99",
+    Compared(OURS, WITH_KNOTS): "#999933",
+    Compared(OURS, _MODES_OVER_TIME): "#332288",
+    Compared(OURS, WITH_ADAPTER): "#aa4499",
+    Compared(OURS, f"{_MODES_OVER_TIME} {WITH_ADAPTER}"): "#661100",
+    Compared("BC"): "#e69f00",
+    Compared("CVAE"): "#d55e00",
+    Compared("in-context"): "#009e73",
+    Compared("language"): "#cc79a7",
+    Compared(FINE_TUNED): "#882255",
+}
+"""Colour of each method, the same in all figures: Okabe and Ito's (2008) and Tol's (2021), safe for colour-blind readers."""
+SPARE = ("#117733", "#ddcc77", "#88ccee", "#555555")
+"""Colours of user methods, used before colours of methods that a figure lacks."""
+COLOURS = (*dict.fromkeys(OF_METHODS.values()), *SPARE)
+"""Colours in order, for lines that are not methods."""
+PAPER_COLOUR = "#9a9a9a"
 LINES = ("dotted", "dashed", "dashdot", (0, (1, 4)), (0, (6, 2, 1, 2, 1, 2)), "solid")
 """Line styles of reference policies."""
 REFERENCE_MARKS = {REPLAYED: "X", FRESH: "*"}
@@ -36,77 +50,92 @@ WIDEST = 60.0
 """Maximum width of a figure in inches; a figure of thousands of settings would fill the memory."""
 
 
-def _width(inches: float) -> float:
-    return min(inches, WIDEST)
+def colours(named: Iterable[tuple[str, Compared]]) -> dict[str, str]:
+    """Assign a colour to each name: its method's colour, else the colour of another form, else a spare colour.
+
+    Args:
+        named: names in a figure with their methods; user methods have spare colours.
+    """
+    chosen: dict[str, str] = {}
+    waiting: dict[str, Compared] = {}
+    for name, method in named:
+        colour = OF_METHODS.get(method)
+        if colour is None or colour in chosen.values():
+            waiting[name] = method
+        else:
+            chosen[name] = colour
+    for name, method in waiting.items():
+        forms = [colour for known, colour in OF_METHODS.items() if known.name == method.name]
+        left = [colour for colour in (*forms, *SPARE, *reversed(COLOURS)) if colour not in chosen.values()]
+        chosen[name] = left[0] if left else COLOURS[len(chosen) % len(COLOURS)]
+    return chosen
 
 
-def _wrapped(setting: str) -> str:
-    """Wrap a label so that neighbours do not touch."""
-    return textwrap.fill(figure_text(setting), 18, break_long_words=False)
+def _bar_axes(bars: int, beside: float) -> tuple[Figure, Axes]:
+    """An empty figure for groups of bars, with ``beside`` inches for axis and legend."""
+    figure = Figure(figsize=(min(1.9 * max(bars, 2) + beside, WIDEST), 3.4), layout="constrained")
+    return figure, figure.subplots()
+
+
+def _once(axes: Axes, label: str) -> str | None:
+    """The legend entry of a label at its first use, else ``None``."""
+    return None if figure_text(label) in axes.get_legend_handles_labels()[1] else figure_text(label)
+
+
+def _policy_line(axes: Axes, index: int, policy: str, mean: float, start: float, end: float) -> None:
+    line = LINES[index % len(LINES)]
+    axes.hlines(mean, start, end, colors="black", linewidth=1, linestyles=line, label=_once(axes, policy))  # type: ignore[arg-type]
+
+
+def _label_bars(axes: Axes, places: Sequence[float], shown: Sequence[str], metric: str, title: str) -> None:
+    """Label axes with settings, wrapped so that neighbours do not touch, and draw the legend."""
+    axes.set_xticks(places, [textwrap.fill(figure_text(setting), 18, break_long_words=False) for setting in shown])
+    axes.set(ylim=(0, 1.05), ylabel=figure_text(metric), title=figure_text(title))
+    axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))
 
 
 def accuracy_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy") -> Figure:
     """Plot a metric of every setting beside the paper's numbers and reference lines, for K = 2 or else the most measured K.
 
-    Error bars are standard errors over tasks.
-
-    Args:
-        domain: the domain.
-        results: rows of the results file.
-        metric: its name in the results.
+    Error bars are standard errors over tasks. ``results`` are rows of a results file.
     """
     rows = labelled(latest(select(results, domain=domain.name, metric=metric)))
     ours, how = main_rows(rows, main_omega(domain))
     shown, learned = settings(domain, ours), sorted(set(ours["label"]))
-    figure = Figure(figsize=(_width(1.9 * max(len(shown), 2) + 3.5), 3.4), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = _bar_axes(len(shown), 3.5)
     colour_of = colours(_labelled_methods(ours))
     width = 0.8 / (len(learned) + 1)
     references = select(rows, role=REFERENCE)
     policies = sorted(set(references["label"]))
-
-    def once(label: str) -> str | None:
-        """Return the legend entry of a label at its first use, else ``None``."""
-        return None if figure_text(label) in axes.get_legend_handles_labels()[1] else figure_text(label)
-
     for place, setting in enumerate(shown):
-        papers = lookup(domain, setting, metric)
-        if papers:
-            axes.bar(place, papers.value, width, yerr=papers.error, color=PAPER_COLOUR, capsize=2, label=once("paper"))
-        for index, label in enumerate(learned, start=1):
-            number = summarise(select(ours, setting=setting, label=label))
-            if number:
-                where = place + index * width
-                axes.bar(where, number.mean, width, yerr=number.error, color=colour_of[label], capsize=2, label=once(label))
-        span = (place - width / 2, place + (len(learned) + 0.5) * width)
+        if papers := lookup(domain, setting, metric):
+            label = _once(axes, "paper")
+            axes.bar(place, papers.value, width, yerr=papers.error, color=PAPER_COLOUR, capsize=2, label=label)
+        for index, name in enumerate(learned, start=1):
+            if number := summarise(select(ours, setting=setting, label=name)):
+                label, colour = _once(axes, name), colour_of[name]
+                axes.bar(place + index * width, number.mean, width, yerr=number.error, color=colour, capsize=2, label=label)
         for index, policy in enumerate(policies):
-            reference = summarise(select(references, setting=setting, label=policy))
-            if reference:
-                line = LINES[index % len(LINES)]
-                axes.hlines(reference.mean, *span, colors="black", linewidth=1, linestyles=line, label=once(policy))  # type: ignore[arg-type]
-    axes.set_xticks([place + width * len(learned) / 2 for place in range(len(shown))], [*map(_wrapped, shown)])
-    axes.set(ylim=(0, 1.05), ylabel=figure_text(metric), title=figure_text(f"{domain.name}, {how}"))
-    axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))
+            if reference := summarise(select(references, setting=setting, label=policy)):
+                span = (place - width / 2, place + (len(learned) + 0.5) * width)
+                _policy_line(axes, index, policy, reference.mean, *span)
+    places = [place + width * len(learned) / 2 for place in range(len(shown))]
+    _label_bars(axes, places, shown, metric, f"{domain.name}, {how}")
     return figure
 
 
 def comparison_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy") -> Figure:
     """Plot a metric of every setting for ours and the baselines, with reference lines and the paper's numbers as diamonds.
 
-    Error bars are standard errors over tasks.
-
-    Args:
-        domain: the domain.
-        results: rows of a comparison.
-        metric: its name in the results.
+    Error bars are standard errors over tasks. ``results`` are rows of a comparison.
     """
     rows = compared(domain, results)
-    rows = rows[rows["metric"] == metric]
-    shown, names = settings(domain, rows), methods(compared(domain, results))
+    names = methods(rows)
+    rows = select(rows, metric=metric)
+    shown = settings(domain, rows)
     colour_of = colours((method_label(*method), method) for method in names)
     width = 0.8 / len(names)
-    figure = Figure(figsize=(_width(1.9 * max(len(shown), 2) + 3), 3.4), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = _bar_axes(len(shown), 3)
     for index, method in enumerate(names):
         method_rows, colour = of_method(rows, method), colour_of[method_label(*method)]
         for place, setting in enumerate(shown):
@@ -117,20 +146,15 @@ def comparison_bars(domain: Domain, results: pd.DataFrame, metric: str = "accura
             elif label and not method_rows.empty:
                 axes.bar(where, 0, width, color=colour, label=label)
             if papers := lookup(domain, setting, metric, method=method):
-                named = "the paper's" not in axes.get_legend_handles_labels()[1]
-                axes.plot(where, papers.value, "D", color="black", markersize=4, label="the paper's" if named else None)
-    references = reference_lines(domain, results)
-    references = references[references["metric"] == metric]
+                axes.plot(where, papers.value, "D", color="black", markersize=4, label=_once(axes, "the paper's"))
+    references = select(reference_lines(domain, results), metric=metric)
     for index, policy in enumerate(sorted(set(references["method"]))):
         policy_rows = select(references, method=policy)
-        for place in (place for place, setting in enumerate(shown) if setting in set(policy_rows["setting"])):
-            label = None if figure_text(policy) in axes.get_legend_handles_labels()[1] else figure_text(policy)
-            mean = select(policy_rows, setting=shown[place])["value"].mean()
-            span, line = (place - 0.45, place + 0.45), LINES[index % len(LINES)]
-            axes.hlines(mean, *span, colors="black", linewidth=1, linestyles=line, label=label)  # type: ignore[arg-type]
-    axes.set_xticks(range(len(shown)), [*map(_wrapped, shown)])
-    axes.set(ylim=(0, 1.05), ylabel=figure_text(metric), title=figure_text(domain.name))
-    axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))
+        for place, setting in enumerate(shown):
+            if setting in set(policy_rows["setting"]):
+                mean = select(policy_rows, setting=setting)["value"].mean()
+                _policy_line(axes, index, policy, mean, place - 0.45, place + 0.45)
+    _label_bars(axes, range(len(shown)), shown, metric, domain.name)
     return figure
 
 
@@ -144,10 +168,8 @@ def overview_dots(results: pd.DataFrame) -> Figure:
     """Plot all domains, settings and metrics of a comparison: a marker for each method, with standard errors over tasks.
 
     Open diamonds are the paper's numbers of the same method; ticks are reference lines. Our forms are limited to the paper's,
-    automatically chosen forms and the default forms of the domains.
-
-    Args:
-        results: see :func:`~ftl_lightning.reporting.comparison.all_methods`.
+    automatically chosen forms and the default forms of the domains. Rows are those of
+    :func:`~ftl_lightning.reporting.comparison.all_methods`.
     """
     lines = shown_lines(results)
     series = _series(methods(results), {domain.comparison.ours for domain, _, _ in lines})
@@ -225,12 +247,7 @@ def _labelled_methods(rows: pd.DataFrame) -> list[tuple[str, Compared]]:
 
 
 def growth(domain: Domain, results: pd.DataFrame) -> Figure:
-    """Plot accuracy against the number of demonstrations and against K, with standard errors over tasks.
-
-    Args:
-        domain: the domain.
-        results: rows of curves.
-    """
+    """Plot accuracy against the number of demonstrations and against K, with standard errors over tasks, from rows of curves."""
     figure = Figure(figsize=(8, 3.2), layout="constrained")
     for axes, axis in zip(figure.subplots(1, len(AXES), sharey=True), AXES, strict=True):
         rows = points(domain, results, axis)
@@ -254,27 +271,20 @@ def frontier(domain: Domain, rows: pd.DataFrame) -> Figure:
     """Plot accuracy over coverage for each suite and setting: a line for each method, temperature from dark to light.
 
     Points are means over tasks and seeds. Less coverage is better, so better methods lie further up and to the left. Crosses and
-    stars are the reference lines *demonstrations replayed* and *fresh samples*.
-
-    Args:
-        domain: the domain.
-        rows: see :func:`ftl_lightning.reporting.frontier.read_frontier`.
+    stars are the reference lines *demonstrations replayed* and *fresh samples*. Rows are those of
+    :func:`~ftl_lightning.reporting.measurements.read_frontier`.
     """
     rows = rows[rows["domain"] == domain.name].dropna(subset=["accuracy", "coverage"])
     rows = rows.assign(panel=rows["setting"] + (", " + rows["suite"] if len(set(rows["suite"])) > 1 else ""))
     shown = list(dict.fromkeys(rows["panel"]))
-    figure = Figure(figsize=(_width(3.6 * max(len(shown), 1) + 2.2), 3.6), layout="constrained")
+    figure = Figure(figsize=(min(3.6 * max(len(shown), 1) + 2.2, WIDEST), 3.6), layout="constrained")
     panels = figure.subplots(1, max(len(shown), 1), sharey=True, squeeze=False)[0]
     lines = labelled(rows[~rows["method"].isin(list(REFERENCE_MARKS))])
     colour_of = colours(_labelled_methods(lines))
     for axes, panel in zip(panels, shown, strict=False):
         for label, colour in colour_of.items():
-            means = (
-                select(lines, panel=panel, label=label)
-                .groupby("temperature", dropna=False)[["coverage", "accuracy"]]
-                .mean()
-                .sort_index()
-            )
+            by_temperature = select(lines, panel=panel, label=label).groupby("temperature", dropna=False)
+            means = by_temperature[["coverage", "accuracy"]].mean().sort_index()
             if means.empty:
                 continue
             axes.plot(means["coverage"], means["accuracy"], color=colour, linewidth=1, label=figure_text(label))
@@ -288,17 +298,14 @@ def frontier(domain: Domain, rows: pd.DataFrame) -> Figure:
     panels[0].set_ylabel(figure_text(domain.main_metric))
     handles = {name: handle for axes in panels for handle, name in zip(*axes.get_legend_handles_labels(), strict=True)}
     figure.legend(list(handles.values()), list(handles), fontsize=8, loc="outside right upper")
-    tempered = lines[lines["method"] != NOISY]
-    figure.suptitle(figure_text(f"{domain.name}: temperature from {_range(tempered)}"), fontsize=10)
+    known = lines.loc[lines["method"] != NOISY, "temperature"].dropna()
+    temperatures = "none" if known.empty else f"{known.min():g} (dark) to {known.max():g}"
+    figure.suptitle(figure_text(f"{domain.name}: temperature from {temperatures}"), fontsize=10)
     return figure
 
 
 def learning_time(curves: Mapping[str, Sequence[Measured]]) -> Figure:
-    """Plot accuracy over seconds of learning, a line for each curve; the dotted line is the accuracy that all curves reach.
-
-    Args:
-        curves: see :func:`ftl_lightning.reporting.speed.read_speed`.
-    """
+    """Plot accuracy over seconds of learning, a line for each curve; the dotted line is the accuracy that all curves reach."""
     figure = Figure(figsize=(6, 3.6), layout="constrained")
     axes = figure.subplots()
     for colour, (name, curve) in zip(COLOURS, curves.items(), strict=False):
@@ -307,34 +314,4 @@ def learning_time(curves: Mapping[str, Sequence[Measured]]) -> Figure:
     axes.axhline(reached(curves), color=PAPER_COLOUR, linestyle="dotted")
     axes.set(xscale="log", xlabel="seconds of learning", ylabel="accuracy", ylim=(-0.05, 1.05))
     figure.legend(fontsize=8, loc="outside upper center", ncols=len(curves))
-    return figure
-
-
-def _range(lines: pd.DataFrame) -> str:
-    known = lines["temperature"].dropna()
-    return "none" if known.empty else f"{known.min():g} (dark) to {known.max():g}"
-
-
-def concept_map(model: ConceptModel, concepts: Sequence[Concept], seed: int = 0) -> Figure:
-    """Plot a t-SNE of training concepts and learned components (paper, figure 'tsne').
-
-    Args:
-        model: the pretrained model.
-        concepts: concepts learned with it.
-        seed: seed of t-SNE.
-
-    Raises:
-        UserError: if scikit-learn is missing.
-    """
-    places = concept_places(model, concepts, seed)
-    figure = Figure(figsize=(9, 6), layout="constrained")
-    axes = figure.subplots()
-    kinds = (False, PAPER_COLOUR, "o", "training concepts"), (True, COLOURS[0], "^", "learned components")
-    for learned, colour, mark, label in kinds:
-        shown = [place for place in places if bool(place.component) == learned]
-        axes.scatter([place.x for place in shown], [place.y for place in shown], color=colour, marker=mark, label=label)
-    for place in places:
-        axes.annotate(figure_text(place.name), (place.x, place.y), fontsize=6, xytext=(3, 3), textcoords="offset points")
-    axes.set(xticks=[], yticks=[], title=figure_text(f"{model.config.domain}: concepts, t-SNE"))
-    axes.legend(fontsize=8)
     return figure

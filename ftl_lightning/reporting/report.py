@@ -11,24 +11,21 @@ from ftl_lightning.domains.comparison import OURS, PAPERS_METHOD
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.evaluation.results import CHANGES, COMPARISON, CURVES, read_rows, read_study, replaced
 from ftl_lightning.evaluation.row import METHOD
-from ftl_lightning.reporting.changes import changes_table
 from ftl_lightning.reporting.comparison import (
     all_methods,
     compared,
-    comparison_tables,
+    comparison_table,
     headline_tables,
     methods,
     overview_tables,
+    references_table,
     short_overview,
 )
-from ftl_lightning.reporting.curves import curves_table
 from ftl_lightning.reporting.figures import accuracy_bars, comparison_bars, frontier, growth, learning_time, overview_dots
-from ftl_lightning.reporting.frontier import FRONTIER, frontier_table, read_frontier
-from ftl_lightning.reporting.shown import domain_of, metrics
-from ftl_lightning.reporting.speed import read_speed
-from ftl_lightning.reporting.table import Table, of_method, select
-from ftl_lightning.reporting.tables import as_learned_most, tables
-from ftl_lightning.services.errors import UserError, shown
+from ftl_lightning.reporting.measurements import FRONTIER, frontier_table, read_frontier, read_speed
+from ftl_lightning.reporting.table import Table, domain_of, metrics, of_method, select
+from ftl_lightning.reporting.tables import as_learned_most, changes_table, curves_table, tables
+from ftl_lightning.services.errors import require, shown
 from ftl_lightning.services.limits import read_text
 from ftl_lightning.services.printing import say
 from ftl_lightning.services.tensor_file import atomic, write_text
@@ -56,7 +53,7 @@ def write_report(results: Path, out: Path, readme: Path | None = None) -> str:
     """
     rows = read_rows(results)
     ablations, comparison, curves, changes = (read_study(results, name) for name in ("", COMPARISON, CURVES, CHANGES))
-    _expect_few(results, (ablations, comparison, curves, changes))
+    _check_few(results, (ablations, comparison, curves, changes))
     tempered = read_frontier(results)
     measured = tempered.dropna(subset=["accuracy", "coverage"])
     if count := len(tempered) - len(measured):
@@ -93,23 +90,16 @@ def write_report(results: Path, out: Path, readme: Path | None = None) -> str:
     return "\n".join(table.markdown() for table in everything)
 
 
-def _expect_few(results: Path, studies: Sequence[pd.DataFrame]) -> None:
-    """Refuse results whose tables would be unreadable and take hours.
-
-    Raises:
-        UserError: naming the exceeded limit.
-    """
-    if (count := len({name for rows in studies for name in rows["domain"]})) > MOST_DOMAINS:
-        raise UserError(f"{results}: expected at most {MOST_DOMAINS} domains, found {count}; report fewer files at a time")
+def _check_few(results: Path, studies: Sequence[pd.DataFrame]) -> None:
+    """Refuse results whose tables would be unreadable and take hours."""
+    domains = len({name for rows in studies for name in rows["domain"]})
+    require(domains <= MOST_DOMAINS, str(results), f"at most {MOST_DOMAINS} domains", f"{domains}; report fewer files at a time")
     for domain, domain_rows in (group for rows in studies for group in rows.groupby("domain")):
         ours = of_method(domain_rows, PAPERS_METHOD)
         cells = domain_rows["setting"].nunique() * len(domain_rows.groupby(["method", "form", "variant"]))
         cells += ours["setting"].nunique() * ours["variant"].nunique() * ours["K"].nunique() * ours["omega"].nunique()
-        if cells > MOST_CELLS:
-            raise UserError(
-                f"{results}: domain {shown(domain)}: expected at most {MOST_CELLS} pairs of a setting and a method, found {cells}; "
-                "report fewer files at a time"
-            )
+        expected = f"at most {MOST_CELLS} pairs of a setting and a method"
+        require(cells <= MOST_CELLS, f"{results}: domain {shown(domain)}", expected, f"{cells}; report fewer files at a time")
 
 
 def _ablations(domain: Domain, rows: pd.DataFrame, folder: Path) -> list[Table]:
@@ -125,7 +115,8 @@ def _compared(domain: Domain, rows: pd.DataFrame, folder: Path) -> list[Table]:
     """Tables and figures of all methods of a domain."""
     for metric in sorted(set(metrics(domain)) & set(compared(domain, rows)["metric"])):
         _save(comparison_bars(domain, rows, metric), folder / f"comparison_{_file(metric)}.png")
-    return [_written(table, folder) for table in (*headline_tables(domain, rows), *comparison_tables(domain, rows))]
+    candidates = (*headline_tables(domain, rows), comparison_table(domain, rows), references_table(domain, rows))
+    return [_written(table, folder) for table in candidates if not table.cells.empty]
 
 
 def _written(table: Table, folder: Path) -> Table:
@@ -147,6 +138,5 @@ def _file(metric: str) -> str:
 def _splice(path: Path, text: str) -> None:
     before, begin, rest = read_text(path, "Markdown").partition(BEGIN)
     _, end, after = rest.partition(END)
-    if not begin or not end:
-        raise UserError(f"{path}: expected the lines {BEGIN!r} and {END!r}, found none; add them where the table belongs")
+    require(begin and end, str(path), f"the lines {BEGIN!r} and {END!r}", "none; add them where the table belongs")
     write_text(path, f"{before}{BEGIN}\n{text}{END}{after}")

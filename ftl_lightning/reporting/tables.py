@@ -4,7 +4,6 @@ import itertools
 from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
 
 import pandas as pd
 
@@ -14,29 +13,25 @@ from ftl_lightning.evaluation.generation import LOST, WON
 from ftl_lightning.evaluation.results import LARGEST_WHOLE, labels, latest
 from ftl_lightning.evaluation.row import METHOD, REFERENCE
 from ftl_lightning.reporting.paired import episodes
-from ftl_lightning.reporting.shown import (
-    component_tasks,
-    environments,
-    learned_settings,
-    lookup,
-    main_omega,
-    metrics,
-    paper_tasks,
-    papers_omega,
-    policies,
-    published,
-    settings,
-)
 from ftl_lightning.reporting.table import (
     MISSING,
     PAPERS,
     Table,
-    difference_to,
+    beside_paper,
+    component_tasks,
+    decisive,
+    lookup,
+    main_omega,
     make_table,
+    metrics,
     of_method,
-    paper,
+    papers_omega,
+    policies,
+    published,
     select,
+    settings,
     summarise,
+    training_settings,
 )
 from ftl_lightning.services.errors import UserError
 
@@ -44,73 +39,53 @@ USUAL_K = 2
 """Number of components in the main tables, as in the paper."""
 LEARNED = "learned"
 """Value of ``omega`` for learned guidance weights."""
-
-
-def _cell(rows: pd.DataFrame) -> str:
-    """Cell text of a number, marked if its weighting differs from the caption's."""
-    number = summarise(rows)
-    marks = dict.fromkeys(rows["mark"]) if "mark" in rows else ()
-    return MISSING if number is None else str(number) + "".join(marks)
-
-
+AXES = {"demonstrations": "K", "K": "demonstrations"}
+"""Axes of curves: the varied column, and the column that stays fixed."""
 BESIDE = ("method", "measured", *PAPERS)
 """Last columns of the tables of our method in all its forms."""
 
-
-def _beside(
-    rows: pd.DataFrame, names: Sequence[str], papers: Callable[[Compared], Published | None] = lambda method: None
-) -> list[list[str]]:
-    """Cells of the columns :data:`BESIDE` for each method with rows.
-
-    Args:
-        rows: rows with labels, see :func:`labelled`.
-        names: labels of methods, in order.
-        papers: the paper's number of a method, or ``None``.
-    """
-    lines = []
-    for name in names:
-        method_rows = select(rows, label=name)
-        if (number := summarise(method_rows)) is not None:
-            published_number = papers(Compared(*method_rows.iloc[0][["method", "form"]]))
-            lines.append([name, _cell(method_rows), paper(published_number), difference_to(published_number, number)])
-    return lines
-
-
-def _references(
-    domain: Domain,
-    name: str,
-    caption: str,
-    rows: pd.DataFrame,
-    subjects: Sequence[tuple[list[str], pd.DataFrame]],
-    heads: Sequence[str],
-) -> Table:
-    """The table of reference lines beside another table.
-
-    Args:
-        domain: the domain.
-        name, caption: of the other table.
-        rows: all rows, for the order of lines.
-        subjects: first cells of each line, and its rows.
-        heads: column names of the first cells.
-    """
-    _, names = _columns(rows)
-    lines = [
-        [*first, label, _cell(reference)]
-        for first, subject_rows in subjects
-        for label in names
-        if not (reference := select(subject_rows, role=REFERENCE, label=label)).empty
-    ]
-    return make_table(domain, f"{name}_references", f"{caption}: reference lines", lines, [*heads, "reference line", "measured"])
-
-
-def _columns(rows: pd.DataFrame) -> tuple[list[str], list[str]]:
-    """Sorted labels of methods and of reference lines."""
-    return tuple(sorted(set(rows.loc[rows["role"] == role, "label"])) for role in (METHOD, REFERENCE))  # type: ignore[return-value]
+Papers = Callable[..., Published | None]
+"""The paper's number by the keyword ``method``."""
 
 
 def labelled(rows: pd.DataFrame) -> pd.DataFrame:
     """Add the column ``label``: the method with its form and variant."""
     return rows.assign(label=labels(rows))
+
+
+def _cell(rows: pd.DataFrame) -> str:
+    """Cell of rows: mean with errors, marked if the weighting differs from the caption's."""
+    number = summarise(rows)
+    marks = dict.fromkeys(rows["mark"]) if "mark" in rows else ()
+    return MISSING if number is None else str(number) + "".join(marks)
+
+
+def _table(
+    domain: Domain,
+    name: str,
+    caption: str,
+    heads: Sequence[str],
+    subjects: Sequence[tuple[Sequence[str], Papers, pd.DataFrame]],
+) -> Table:
+    """A table with a line for each method of each subject: first cells, the paper's numbers, and labelled rows."""
+    lines = []
+    for first, papers, subject_rows in subjects:
+        for label, rows in subject_rows.groupby("label"):
+            published_number = papers(method=Compared(*rows.iloc[0][["method", "form"]]))
+            lines.append([*first, str(label), _cell(rows), *beside_paper(summarise(rows), published_number)])
+    return make_table(domain, name, caption, lines, [*heads, *BESIDE])
+
+
+def _references(
+    domain: Domain, name: str, caption: str, heads: Sequence[str], subjects: Sequence[tuple[Sequence[str], pd.DataFrame]]
+) -> Table:
+    """The table of reference lines that accompanies the table ``name``; subjects are first cells and labelled rows."""
+    lines = [
+        [*first, str(label), _cell(rows)]
+        for first, subject_rows in subjects
+        for label, rows in select(subject_rows, role=REFERENCE).groupby("label")
+    ]
+    return make_table(domain, f"{name}_references", f"{caption}: reference lines", lines, [*heads, "reference line", "measured"])
 
 
 def weighting(components: int, omega: str) -> str:
@@ -135,7 +110,7 @@ def main_rows(rows: pd.DataFrame, omega: str) -> tuple[pd.DataFrame, str]:
         The rows, with the weighting of ours in the column ``mark`` where it differs from the caption's; and the caption's words
         for the weighting.
     """
-    rows = rows[rows["role"] == METHOD]
+    rows = select(rows, role=METHOD)
     usual = (USUAL_K, omega)
     parts = []
     for _, setting_rows in rows.groupby(["label", "setting"], sort=False):
@@ -170,63 +145,62 @@ def as_learned_most(domain: Domain, rows: pd.DataFrame) -> pd.DataFrame:
 
 def tables(domain: Domain, results: pd.DataFrame) -> list[Table]:
     """All tables of a domain that have results, with separate tables of reference lines."""
-    domain_rows = labelled(latest(select(results, domain=domain.name)))
+    rows = labelled(latest(select(results, domain=domain.name)))
     metric = domain.main_metric
-    rows = select(domain_rows, metric=metric)
+    ours = of_method(rows, PAPERS_METHOD)
+    counts = Counter(components for components, _ in _weightings(ours) if components)
+    count = USUAL_K if USUAL_K in counts or not counts else counts.most_common(1)[0][0]
+    by_count = f"{domain.name}: number of learned concepts K, with learned weights"
+    by_omega = f"{domain.name}: guidance weight omega, K = {count}"
     candidates = (
         *(() if metric == EXECUTED else _accuracy(domain, rows, metric, "accuracy")),
-        *_accuracy(domain, select(domain_rows, metric=EXECUTED), EXECUTED, "closed_loop"),
-        *_outcomes(domain, domain_rows),
-        _paired(domain, domain_rows),
-        _count(domain, domain_rows),
-        _omega(domain, domain_rows),
-        _components(domain, rows, metric),
+        *_accuracy(domain, rows, EXECUTED, "closed_loop"),
+        *_outcomes(domain, rows),
+        _paired(domain, rows),
+        _ablation(domain, "concept_count", by_count, select(ours, omega=LEARNED), "K"),
+        _ablation(domain, "omega", by_omega, select(ours, K=count), "omega"),
+        _components(domain, select(rows, metric=metric), metric),
     )
     return [table for table in candidates if not table.cells.empty]
 
 
 def _accuracy(domain: Domain, rows: pd.DataFrame, metric: str, name: str) -> list[Table]:
-    """The numbers of the paper's main figure, and trivial policies and the oracle."""
-    learned_labels, _ = _columns(rows)
+    """The numbers of the paper's main figure: each setting, and its tasks with a published number."""
+    rows = select(rows, metric=metric)
     selected, how = main_rows(rows, main_omega(domain))
-    lines, subjects = [], []
+    numbers = [number for number in published(domain) if number.task and number.omega == papers_omega(domain)]
+    subjects, references = [], []
     for setting in settings(domain, selected):
-        for task in ("", *paper_tasks(domain, setting)):
+        for task in ("", *(number.task for number in numbers if number.setting == setting)):
             subject = {"setting": setting} | ({"task": task} if task else {})
-            first = [f"- {task}" if task else setting]
-            number = partial(_of_paper, domain, setting, metric, task=task)
-            lines += [[*first, *line] for line in _beside(select(selected, **subject), learned_labels, number)]
-            if not select(selected, **subject).empty:
-                subjects.append((first, select(rows, **subject)))
-    papers_weight = ""
-    if published(domain) and main_omega(domain) != papers_omega(domain):
-        papers_weight = f" (the paper's: {papers_omega(domain)})"
+            first, papers = [f"- {task}" if task else setting], partial(lookup, domain, setting, metric, task)
+            if not (measured := select(selected, **subject)).empty:
+                subjects.append((first, papers, measured))
+                references.append((first, select(rows, **subject)))
+    different = bool(published(domain)) and main_omega(domain) != papers_omega(domain)
+    papers_weight = f" (the paper's: {papers_omega(domain)})" if different else ""
     caption = f"{domain.name}: {metric}, {how}{papers_weight}. Mean ± standard error over tasks (spread over seeds)"
-    references = _references(domain, name, f"{domain.name}: {metric}", rows, subjects, ["setting"])
-    return [make_table(domain, name, caption, lines, ["setting", *BESIDE]), references]
-
-
-def _of_paper(domain: Domain, setting: str, metric: str, method: Compared, task: str = "", **learned: Any) -> Published | None:
-    return lookup(domain, setting, metric, task, method=method, **learned)
+    return [
+        _table(domain, name, caption, ["setting"], subjects),
+        _references(domain, name, f"{domain.name}: {metric}", ["setting"], references),
+    ]
 
 
 def _outcomes(domain: Domain, rows: pd.DataFrame) -> list[Table]:
     """All outcomes in closed loop, by setting."""
     executed = rows[rows["metric"].str.startswith(CLOSED)]
     selected, how = main_rows(executed, main_omega(domain))
-    learned_labels, _ = _columns(executed)
-    lines, subjects = [], []
+    subjects, references = [], []
     for setting in settings(domain, selected):
         for metric in dict.fromkeys(select(selected, setting=setting)["metric"]):
             first = [setting, metric.removeprefix(f"{CLOSED} ")]
-            number = partial(_of_paper, domain, setting, metric)
-            measured = select(selected, setting=setting, metric=metric)
-            lines += [[*first, *line] for line in _beside(measured, learned_labels, number)]
-            subjects.append((first, select(executed, setting=setting, metric=metric)))
+            papers = partial(lookup, domain, setting, metric)
+            subjects.append((first, papers, select(selected, setting=setting, metric=metric)))
+            references.append((first, select(executed, setting=setting, metric=metric)))
     caption, heads = f"{domain.name}: what happened in closed loop", ["setting", "outcome"]
     return [
-        make_table(domain, "outcomes", f"{caption}, {how}", lines, [*heads, *BESIDE]),
-        _references(domain, "outcomes", caption, executed, subjects, heads),
+        _table(domain, "outcomes", f"{caption}, {how}", heads, subjects),
+        _references(domain, "outcomes", caption, heads, references),
     ]
 
 
@@ -252,10 +226,12 @@ def against(ours: pd.DataFrame, policy: str) -> tuple[int, int, int] | None:
 def _paired(domain: Domain, rows: pd.DataFrame) -> Table:
     """Difference between our success and that of reference policies from the same starts, over all seeds, by environment."""
     selected, _ = main_rows(rows, main_omega(domain))
-    learned_labels, _ = _columns(selected[selected["metric"].str.startswith(WON)])
+    learned = sorted(set(selected.loc[selected["metric"].str.startswith(WON), "label"]))
+    # Suffixes of outcomes by environment: none for the default environment.
+    environments = ("", *(f" ({name})" for name in domain.closed_loop.others)) if domain.closed_loop else ()
     lines, elsewhere = [], ""
-    for setting, label in itertools.product(settings(domain, selected), learned_labels):
-        for place, name in itertools.product(environments(domain), policies(domain)):
+    for setting, label in itertools.product(settings(domain, selected), learned):
+        for place, name in itertools.product(environments, policies(domain)):
             counts = against(select(selected, setting=setting, label=label), f"{name}{place}")
             if counts is not None:
                 lines.append([setting, label, f"{name}{place}", episodes(*counts)])
@@ -268,75 +244,94 @@ def _paired(domain: Domain, rows: pd.DataFrame) -> Table:
     return make_table(domain, "paired", caption, lines, ["setting", "method", "compared with", "difference"])
 
 
-def _grid(
-    domain: Domain,
-    name: str,
-    caption: str,
-    rows: pd.DataFrame,
-    lines: Sequence[tuple[Sequence[str], Callable[[Compared], Published | None], pd.DataFrame]],
-    heads: Sequence[str],
-) -> Table:
-    """A table with a line for each method of each subject (first cells, the paper's number of a method, rows)."""
-    learned_labels, _ = _columns(rows)
-    cells = [[*first, *line] for first, papers, line_rows in lines for line in _beside(line_rows, learned_labels, papers)]
-    return make_table(domain, name, caption, cells, [*heads, *BESIDE])
+def _ablation(domain: Domain, name: str, caption: str, ours: pd.DataFrame, column: str) -> Table:
+    """Ablation of the number of learned concepts (column ``K``) or of the guidance weight (column ``omega``).
 
-
-def _judged(domain: Domain, rows: pd.DataFrame) -> list[str]:
-    """Metrics of the tables of K and omega: the main metric, failures in closed loop, and the paper's metrics."""
-    wrong = [metric for metric in metrics(domain) if domain.less_is_better(metric)]
+    Metrics are the main metric, failures in closed loop, and the paper's metrics. Training settings are left out.
+    """
+    failures = [metric for metric in metrics(domain) if domain.less_is_better(metric)]
     papers = [number.metric for number in published(domain)]
-    return [metric for metric in dict.fromkeys((domain.main_metric, *wrong, *papers)) if metric in set(rows["metric"])]
-
-
-def _count(domain: Domain, rows: pd.DataFrame) -> Table:
-    """Ablation of the number of learned concepts, with learned weights."""
-    ours = select(of_method(rows, PAPERS_METHOD), omega=LEARNED)
-    lines = [
+    shown = [metric for metric in dict.fromkeys((domain.main_metric, *failures, *papers)) if metric in set(ours["metric"])]
+    ours = ours[ours["K"] > 0]
+    subjects = [
         (
-            (setting, str(count), metric),
-            partial(_of_paper, domain, setting, metric, components=count, omega=LEARNED),
-            select(ours, setting=setting, K=count, metric=metric),
+            (setting, str(value), metric),
+            partial(lookup, domain, setting, metric, components=int(rows["K"].iloc[0]), omega=str(rows["omega"].iloc[0])),
+            select(rows, metric=metric),
         )
-        for setting in learned_settings(domain, ours)
-        for count in sorted(set(ours.loc[ours["K"] > 0, "K"]))
-        for metric in _judged(domain, ours)
+        for setting in settings(domain, ours)
+        if setting not in training_settings(domain)
+        for value in sorted(set(ours[column]))
+        if not (rows := select(ours, setting=setting, **{column: value})).empty
+        for metric in shown
     ]
-    caption = f"{domain.name}: number of learned concepts K, with learned weights"
-    return _grid(domain, "concept_count", caption, ours, lines, ("setting", "K", "metric"))
-
-
-def _omega(domain: Domain, rows: pd.DataFrame) -> Table:
-    """Ablation of the guidance weight, for K = 2 or else the most measured K."""
-    ours = of_method(rows, PAPERS_METHOD)
-    counts = Counter(components for components, _ in _weightings(ours) if components)
-    count = USUAL_K if USUAL_K in counts or not counts else counts.most_common(1)[0][0]
-    ours = select(ours, K=count)
-    lines = [
-        (
-            (setting, omega, metric),
-            partial(_of_paper, domain, setting, metric, components=count, omega=omega),
-            select(ours, setting=setting, omega=omega, metric=metric),
-        )
-        for setting in learned_settings(domain, ours)
-        for omega in sorted(set(ours["omega"]))
-        for metric in _judged(domain, ours)
-    ]
-    caption = f"{domain.name}: guidance weight omega, K = {count}"
-    return _grid(domain, "omega", caption, ours, lines, ("setting", "omega", "metric"))
+    return _table(domain, name, caption, ("setting", column, "metric"), subjects)
 
 
 def _components(domain: Domain, rows: pd.DataFrame, metric: str) -> Table:
     """Each learned component alone, with learned weights or else the most measured weighting."""
     tasks = component_tasks(domain)
     selected, how = main_rows(rows[rows["setting"].isin({task.setting for task in tasks})], LEARNED)
-    lines = [
+    subjects = [
         (
             (task.name, task.setting),
-            partial(_of_paper, domain, task.setting, metric, task=task.name, omega=LEARNED),
+            partial(lookup, domain, task.setting, metric, task.name, omega=LEARNED),
             select(selected, setting=task.setting, task=task.name),
         )
         for task in tasks
     ]
     caption = f"{domain.name}: {metric} of what each learned component generates alone, {how.removeprefix(f'K = {USUAL_K}, ')}"
-    return _grid(domain, "components", caption, selected, lines, ("concept", "generated from"))
+    return _table(domain, "components", caption, ("concept", "generated from"), subjects)
+
+
+def points(domain: Domain, results: pd.DataFrame, axis: str) -> pd.DataFrame:
+    """The rows of a domain's headline, or else its main metric, along an axis of a curve.
+
+    The other column of :data:`AXES` and the guidance weight have the values with most points on the axis. Ties go to the weight of
+    the main tables for demonstrations, and to learned weights for K, as fixed weights per component would increase guidance with
+    K. Settings with the initial states of the demonstrations are left out: they have no more samples than demonstrations.
+    """
+    rows = latest(select(results, domain=domain.name, role=METHOD))
+    rows = select(rows, metric=decisive(domain, rows))
+    rows = rows[(rows["K"] > 0) & (rows["demonstrations"] > 0) & (rows["n"] > rows["demonstrations"])]
+    if rows.empty:
+        return rows
+    preferred = main_omega(domain) if axis == "demonstrations" else LEARNED
+    measured = rows.groupby([AXES[axis], "omega"])[axis].nunique()
+    stays, omega = max(measured.index, key=lambda pair: (measured[pair], pair[1] == preferred))
+    return select(rows, omega=omega, **{AXES[axis]: stays})
+
+
+def curves_table(domain: Domain, results: pd.DataFrame) -> Table:
+    """Accuracy by number of demonstrations and number of components: a line for each setting and axis."""
+    lines, grown = [], {axis: points(domain, results, axis) for axis in AXES}
+    counts = sorted({count for axis, rows in grown.items() for count in rows[axis]})
+    for axis, rows in grown.items():
+        for setting in dict.fromkeys(rows["setting"]):
+            lines.append([setting, axis, *(_cell(select(rows, setting=setting, **{axis: count})) for count in counts)])
+    metric = next((name for rows in grown.values() for name in rows["metric"]), domain.main_metric)
+    kept = {axis: rows.iloc[0] for axis, rows in grown.items() if len(rows)}
+    axes = ", ".join(f"{axis} ({AXES[axis]} = {row[AXES[axis]]}, omega {row['omega']})" for axis, row in kept.items())
+    caption = f"{domain.name}: {metric} by {axes}. Mean ± standard error over tasks (spread over seeds)"
+    return make_table(None, "curves", caption, lines, ["setting", "of", *map(str, counts)])
+
+
+def changes_table(domain: Domain, results: pd.DataFrame) -> Table:
+    """Ablation of the changes to the paper's form: ours, and ours without a single change at a time.
+
+    There is a line for each variant in the order of the rows, and a column for each setting. The metric is the domain's headline or
+    else its main metric.
+    """
+    rows = latest(select(results, domain=domain.name, role=METHOD))
+    metric = decisive(domain, rows)
+    rows = select(rows, metric=metric)
+    columns = list(dict.fromkeys(rows["setting"]))
+    lines = [
+        [variant, *(_cell(select(rows, variant=variant, setting=setting)) for setting in columns)]
+        for variant in dict.fromkeys(rows["variant"])
+    ]
+    caption = (
+        f"{domain.name}: {metric} of ours, and with one change to the paper's form taken away at a time. "
+        "Mean ± standard error over tasks (spread over seeds)"
+    )
+    return make_table(None, "changes", caption, lines, ["variant", *columns])

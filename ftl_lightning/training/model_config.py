@@ -11,7 +11,7 @@ from torch import Tensor
 from ftl_lightning.data.normalization import Normalization
 from ftl_lightning.domains.domain import Domain, View
 from ftl_lightning.domains.from_file import OWN
-from ftl_lightning.networks.denoiser import Sizes
+from ftl_lightning.networks.conditions import Sizes
 from ftl_lightning.services.errors import UserError, about, short, shown
 from ftl_lightning.services.ranges import LARGEST, check_range
 from ftl_lightning.services.schema import check_type, read_json

@@ -20,7 +20,7 @@ from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.igm.settings import BudgetOptions
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.methods.ftl_igm.pretraining import PretrainingModule
-from ftl_lightning.networks.hashing import HashingEncoder
+from ftl_lightning.networks.text_encoder import HashingEncoder
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.training.data import InversionData, OwnData
 from ftl_lightning.training.inversion_module import InversionModule

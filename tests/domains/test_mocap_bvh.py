@@ -24,7 +24,7 @@ from tests.domains.test_mocap_rendering import waving
 
 
 def imported(path: Path) -> Demonstrations:
-    return DOMAIN.imports[path.suffix](path)
+    return DOMAIN.recordings.imports[path.suffix](path)
 
 
 def exported(path: Path, states: Tensor) -> Path:

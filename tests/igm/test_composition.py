@@ -7,7 +7,7 @@ from ftl_lightning.igm.composition import Composition, batched
 from ftl_lightning.igm.diffusion import Context, Denoiser
 from ftl_lightning.igm.guidance import composed_epsilon
 from ftl_lightning.networks import MLPDenoiser
-from ftl_lightning.networks.denoiser import Sizes
+from ftl_lightning.networks.conditions import Sizes
 
 torch.manual_seed(0)
 SIZES = Sizes(horizon=2, state_dim=3, concept_dim=4, observed={"place": Feature((5,))})

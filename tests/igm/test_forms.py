@@ -27,7 +27,7 @@ from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.igm.settings import InversionSettings
 from ftl_lightning.methods.ftl_igm.model import DiffusionConfig, GenerativeModel
 from ftl_lightning.networks import TemporalUNet
-from ftl_lightning.networks.denoiser import Sizes
+from ftl_lightning.networks.conditions import Sizes
 from ftl_lightning.networks.temporal_unet import over_time
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.training.model_config import Prepared

@@ -1,6 +1,6 @@
 import torch
 
-from ftl_lightning.networks.hashing import DIMENSION, HashingEncoder
+from ftl_lightning.networks.text_encoder import DIMENSION, HashingEncoder
 
 ENCODER = HashingEncoder()
 

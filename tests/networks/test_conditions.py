@@ -17,8 +17,7 @@ from ftl_lightning.evaluation.closed_loop import sampled_plans
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.methods.ftl_igm.model import DiffusionConfig, GenerativeModel
-from ftl_lightning.networks.conditions import CHOSEN, ENCODERS, EntityEncoder, PointEncoder, condition_encoder
-from ftl_lightning.networks.denoiser import Sizes
+from ftl_lightning.networks.conditions import CHOSEN, ENCODERS, EntityEncoder, PointEncoder, Sizes, condition_encoder
 from ftl_lightning.networks.mlp import MLPDenoiser
 from ftl_lightning.networks.temporal_unet import TemporalUNet
 from ftl_lightning.services.errors import UserError

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from ftl_lightning.networks import MLPDenoiser
-from ftl_lightning.networks.denoiser import Sizes
+from ftl_lightning.networks.conditions import Sizes
 
 SIZES = Sizes(1, 21, 48)
 

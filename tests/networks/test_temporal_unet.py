@@ -9,8 +9,7 @@ from torch import Tensor
 from ftl_lightning.data.features import Feature
 from ftl_lightning.igm.diffusion import LOSSES, Prediction, add_noise, cosine_alpha_bar, loss_weights
 from ftl_lightning.networks import MLPDenoiser, TemporalUNet
-from ftl_lightning.networks.conditions import EntityEncoder
-from ftl_lightning.networks.denoiser import Sizes
+from ftl_lightning.networks.conditions import EntityEncoder, Sizes
 from ftl_lightning.services.errors import UserError
 
 ENTITIES = ((4, 5), (7, 8))

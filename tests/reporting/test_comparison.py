@@ -14,8 +14,6 @@ from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.evaluation.results import append_rows, read_rows, read_study
 from ftl_lightning.evaluation.row import Row
 from ftl_lightning.igm.concept import Concept, Origin
-from ftl_lightning.reporting.changes import changes_table
-from ftl_lightning.reporting.colours import COLOURS, OF_METHODS, colours
 from ftl_lightning.reporting.comparison import (
     all_methods,
     comparison_table,
@@ -24,11 +22,11 @@ from ftl_lightning.reporting.comparison import (
     references_table,
     short_overview,
 )
-from ftl_lightning.reporting.curves import curves_table
-from ftl_lightning.reporting.figures import comparison_bars, concept_map, growth, overview_dots
+from ftl_lightning.reporting.concept_figures import concept_map
+from ftl_lightning.reporting.figures import COLOURS, OF_METHODS, colours, comparison_bars, growth, overview_dots
 from ftl_lightning.reporting.report import BEGIN, END
 from ftl_lightning.reporting.table import MOST_COLUMNS, Table, select
-from ftl_lightning.reporting.tables import tables
+from ftl_lightning.reporting.tables import changes_table, curves_table, tables
 from ftl_lightning.training.model_folder import load_model
 from tests.conftest import ROOT
 from tests.evaluation.rows import REFERENCE

@@ -14,7 +14,7 @@ from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.igm.forms.leave_one_out import LeaveOneOut, leave_one_out, odd_one, relative_losses, subsets
-from ftl_lightning.reporting.check_figure import picture
+from ftl_lightning.reporting.concept_figures import check_figure
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.training.checks import Known, scale_findings, warnings_of
 from tests.conftest import CONF, ROOT, refused, succeed
@@ -42,7 +42,7 @@ def test_a_known_concept_is_recognised_and_a_new_one_is_not_and_a_picture_is_dra
     other = scenes.check(scenes.domain.source(None).draw(NEW, 5, 0), name=NEW).known
     assert not other.clear
     assert str(other).startswith("known: no training concept explains them all")
-    assert len(picture([found]).axes) == 2
+    assert len(check_figure([found]).axes) == 2
 
 
 def test_the_empty_concept_explains_as_much_as_itself(scenes: FewShot, five: Demonstrations) -> None:

@@ -1,9 +1,9 @@
-"""How a concept has to be learned so that it arrives: the validation scenario in closed loop, with settings of the inversion.
+"""Closed-loop success in the validation scenario of driving by settings of the inversion.
 
     python benchmarks/experiments/driving/arrivals.py --learn '{"guidance_scale": 1.0, "tolerance": 0.03}'
 
-Three pretrained models (those that ``ablate --config conf/ablation/driving.yaml`` makes), each with two sets of demonstrations, and
-for each of these six other new starts, none of which an evaluation uses. Four minutes on one thread.
+Uses the three pretrained models of ``ablate --config conf/ablation/driving.yaml``, two sets of demonstrations for each model, and
+six new starts for each set that no evaluation uses. Takes four minutes on one thread.
 """
 
 import argparse

@@ -1,10 +1,10 @@
-"""Drives of the expert that knows no more than what can be seen, of all training scenarios.
+"""Record drives of an expert that is limited to observable information, in all training scenarios.
 
     python benchmarks/experiments/driving/blind.py --out logs/blind --count 110
     python -m ftl_lightning fit --config conf/driving.yaml --data.root logs/blind --model.output logs/blind/pretrained
 
-Each episode is kept as it is made: a run that is killed goes on where it stopped. A drive takes from three seconds (highway) to
-fifteen (intersection).
+Each episode is saved when it ends, so an interrupted run resumes. A drive takes three seconds (highway) to fifteen
+(intersection).
 """
 
 import argparse

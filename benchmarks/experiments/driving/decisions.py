@@ -1,11 +1,10 @@
-"""What five drives teach: how often policies decide as the expert does, on drives of the expert from new starts.
+"""Agreement of policies learned from five drives with the decisions of the expert, on its drives from new starts.
 
     python benchmarks/experiments/driving/decisions.py --task "roundabout third exit" --drives 30
     python benchmarks/experiments/driving/decisions.py --task roundabout --pretrained logs/ablation/driving-steps{0,1,2}/pretrained
 
-The expert drives; at each decision every policy is asked what it would do there. Its wish is turned into a decision by the planner
-and its veto, as in closed loop. Two decisions that make the same of the vehicle, such as keeping and raising the highest speed, are
-the same.
+The expert drives, and every policy is queried at each of its decisions. The planner and its veto turn the policy's output into a
+decision, as in closed loop. Decisions with the same effect on the vehicle (keeping and raising the highest speed) are equal.
 
 - *agreement*: share of decisions that are the expert's, the mean over drives and its standard error;
 - *go*, *wait*: the same of those decisions by which the expert speeds up, or drives at its highest speed, and of all others;

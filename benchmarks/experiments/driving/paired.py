@@ -1,9 +1,9 @@
-"""Which method is ahead in driving, episode by episode: all of them from the same starts, with models of their own for each seed.
+"""Paired comparison of all methods in driving by episode, with the same starts and separate models for each seed.
 
     python benchmarks/experiments/driving/paired.py --out results/driving_paired.json
 
-Takes the models that ``ablate --config conf/ablation/comparison.yaml`` pretrains, and makes its episodes again: one task and three
-seeds are too few pairs of *rates* to decide anything, but 150 pairs of *episodes* may. Ten minutes on one thread.
+Repeats the episodes of ``ablate --config conf/ablation/comparison.yaml`` with the models that it pretrains. A single task and three
+seeds are too few pairs of *rates* for a test; 150 pairs of *episodes* may suffice. Takes ten minutes on one thread.
 """
 
 import argparse

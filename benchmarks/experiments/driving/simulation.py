@@ -1,8 +1,8 @@
-"""What the expert costs: with deep copies of the published simulation, and with ours.
+"""Run time of the driving expert with deep copies of the published simulation, and with exact save and restore.
 
 python benchmarks/experiments/driving/simulation.py [--out results/driving_speed.json]
 
-A minute or two a scenario, nearly all of it for the deep copies. Both drive the same episode with the same search.
+Both drive the same episode with the same search. A scenario takes a minute or two, mostly for the deep copies.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""What looking ahead costs: seconds of episodes that follow a learned concept's plans, with each veto.
+"""Run time of driving episodes with each veto, following plans of a learned concept.
 
     python benchmarks/experiments/driving/vetoes.py [--out results/driving_vetoes.json]
 

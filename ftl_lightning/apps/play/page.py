@@ -153,7 +153,7 @@ def results_page(file: str) -> str:
     Raises:
         UserError: if there are no results.
     """
-    from ftl_lightning.reporting.html.page import write_page
+    from ftl_lightning.reporting.page import write_page
 
     with tempfile.TemporaryDirectory() as folder:
         page = Path(folder) / "page.html"

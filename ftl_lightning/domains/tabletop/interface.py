@@ -214,7 +214,7 @@ def misplaced(read: Tensor, places: Tensor) -> Tensor:
 
     Args:
         read: x, y, height and visibility logit of each object, all x first ``(sample, 20)``; see
-            :class:`ftl_lightning.networks.image_encoder.Points`.
+            :class:`ftl_lightning.networks.image_encoder.ImageEncoder`.
         places: :data:`~ftl_lightning.domains.tabletop.interface.SEEN` ``(sample, 5, 4)``.
     """
     read, seen = read.unflatten(1, (4, -1)).transpose(1, 2), places[..., 0]

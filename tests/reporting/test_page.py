@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from ftl_lightning.evaluation.results import read_rows
-from ftl_lightning.reporting.html.page import FILMS
+from ftl_lightning.reporting.page import FILMS
 from ftl_lightning.reporting.table import select
 from tests.conftest import ROOT, Once, refused, succeed
 

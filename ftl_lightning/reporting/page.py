@@ -16,14 +16,13 @@ from ftl_lightning.evaluation.pictures import FORMAT
 from ftl_lightning.evaluation.results import COMPARISON, CURVES, latest, read_rows, read_study
 from ftl_lightning.evaluation.row import METHOD, REFERENCE, label
 from ftl_lightning.igm.concept import Concept
-from ftl_lightning.reporting.colours import COLOURS, colours
 from ftl_lightning.reporting.comparison import METHODS, all_methods, compared, methods, reference_lines, shown_lines
-from ftl_lightning.reporting.concept_places import concept_places
-from ftl_lightning.reporting.curves import AXES, points
-from ftl_lightning.reporting.shown import decisive, domain_of, lookup, settings
-from ftl_lightning.reporting.speed import read_speed
-from ftl_lightning.reporting.table import of_method, select, summarise
-from ftl_lightning.services.errors import UserError
+from ftl_lightning.reporting.concept_figures import concept_places
+from ftl_lightning.reporting.figures import COLOURS, colours
+from ftl_lightning.reporting.measurements import read_speed
+from ftl_lightning.reporting.table import decisive, domain_of, lookup, of_method, select, settings, summarise
+from ftl_lightning.reporting.tables import AXES, points
+from ftl_lightning.services.errors import UserError, require
 from ftl_lightning.services.printing import say
 from ftl_lightning.services.schema import read_json
 from ftl_lightning.services.shipped import shipped
@@ -84,33 +83,26 @@ def _title(domain: Domain) -> str:
     return domain.name.replace("_", " ")
 
 
-def _ordered(names: Mapping[str, None]) -> list[str]:
-    """Methods in the order of tables, then other names; for consistent colours."""
-    order = [label(*method) for method in METHODS]
-    return [*(name for name in order if name in names), *(name for name in names if name not in order)]
-
-
 def _line(domain: Domain, setting: str, metric: str, results: pd.DataFrame) -> dict[str, Any]:
     """Means of methods and reference lines."""
     rows = compared(domain, results)
-    here, beside = (select(table, setting=setting, metric=metric) for table in (rows, reference_lines(domain, results)))
+    measured, references = (select(table, setting=setting, metric=metric) for table in (rows, reference_lines(domain, results)))
+    means = []
+    for method in methods(rows):
+        if number := summarise(of_method(measured, method)):
+            papers = lookup(domain, setting, metric, method=method)
+            error = None if number.error is None else round(number.error, 4)
+            mean = {"method": label(*method), "mean": round(number.mean, 4), "error": error}
+            means.append({**mean, "paper": papers.value if papers else None})
     return {
         "domain": domain.name,
         "name": _title(domain),
         "setting": setting,
         "metric": metric,
         "less": domain.less_is_better(metric),
-        "methods": [mean for method in methods(rows) if (mean := _mean(domain, here, method, setting, metric))],
-        "references": {str(name): round(float(value), 4) for name, value in beside.groupby("method")["value"].mean().items()},
+        "methods": means,
+        "references": {str(name): round(float(value), 4) for name, value in references.groupby("method")["value"].mean().items()},
     }
-
-
-def _mean(domain: Domain, rows: pd.DataFrame, method: Compared, setting: str, metric: str) -> dict[str, Any] | None:
-    number, papers = summarise(of_method(rows, method)), lookup(domain, setting, metric, method=method)
-    if number is None:
-        return None
-    error = None if number.error is None else round(number.error, 4)
-    return {"method": label(*method), "mean": round(number.mean, 4), "error": error, "paper": papers.value if papers else None}
 
 
 def _films(results: Path, shown: Sequence[Domain], rows: pd.DataFrame) -> tuple[list[dict[str, Any]], dict[str, Any]]:
@@ -125,8 +117,8 @@ def _films(results: Path, shown: Sequence[Domain], rows: pd.DataFrame) -> tuple[
     films, shapes = [], {}
     for path in visible(results / FILMS, "*.json"):
         content = read_json(path)
-        if not isinstance(content, dict) or content.get("format") != FORMAT:
-            raise UserError(f"{path}: expected films of format {FORMAT}, found something else; make them with evaluation.films")
+        is_films = isinstance(content, dict) and content.get("format") == FORMAT
+        require(is_films, str(path), f"films of format {FORMAT}", "something else; make them with evaluation.films")
         try:
             if (name := str(content["domain"])) in decided:
                 shapes[path.stem] = content["shapes"]
@@ -134,7 +126,9 @@ def _films(results: Path, shown: Sequence[Domain], rows: pd.DataFrame) -> tuple[
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             message = f"expected films as evaluation.films writes them, found a file with other keys ({error!r}); make it again"
             raise UserError(f"{path}: {message}") from error
-    order = {name: place for place, name in enumerate(_ordered(dict.fromkeys(film["method"] for film in films)))}
+    # Methods have the order of tables, for consistent colours; other names follow in order of appearance.
+    names = (*(label(*method) for method in METHODS), *(film["method"] for film in films))
+    order = {name: place for place, name in enumerate(dict.fromkeys(names))}
     return sorted(films, key=lambda film: (film["domain"], film["reference"], order[film["method"]])), shapes
 
 
@@ -179,14 +173,17 @@ def _map(results: Path, domain: Domain) -> Iterator[dict[str, Any]]:
     except UserError as error:  # scikit-learn or the domain's package is missing
         say(f"concepts of {domain.name} are left out: {error}", error=True)
         return
-    yield {
-        "domain": domain.name,
-        "name": _title(domain),
-        "points": [
-            {"x": round(mark.x, 2), "y": round(mark.y, 2), "name": mark.name, "film": mark.concept, "learned": bool(mark.component)}
-            for mark in places
-        ],
-    }
+    marks = [
+        {
+            "x": round(place.x, 2),
+            "y": round(place.y, 2),
+            "name": place.name,
+            "film": place.concept,
+            "learned": bool(place.component),
+        }
+        for place in places
+    ]
+    yield {"domain": domain.name, "name": _title(domain), "points": marks}
 
 
 def _curves(shown: Sequence[Domain], results: pd.DataFrame) -> Iterator[dict[str, Any]]:
@@ -199,30 +196,18 @@ def _curves(shown: Sequence[Domain], results: pd.DataFrame) -> Iterator[dict[str
             lines = []
             for setting in settings(domain, rows):
                 numbers = [(count, summarise(select(rows, setting=setting, **{axis: count}))) for count in counts]
-                lines.append(
-                    {
-                        "name": setting,
-                        "points": [[count, round(value.mean, 4), round(value.error or 0, 4)] for count, value in numbers if value],
-                    }
-                )
-            metric = " ".join(sorted(set(rows["metric"])))
-            title = f"{_title(domain)}, {metric}"
+                means = [[count, round(value.mean, 4), round(value.error or 0, 4)] for count, value in numbers if value]
+                lines.append({"name": setting, "points": means})
+            title = f"{_title(domain)}, {' '.join(sorted(set(rows['metric'])))}"
             yield {"domain": domain.name, "title": title, "axis": axis, "log": False, "ticks": counts, "lines": lines}
 
 
 def _speed(results: Path) -> Iterator[dict[str, Any]]:
     if curves := read_speed(results):
-        lines = [
-            {"name": name, "points": [[round(row.seconds, 3), row.accuracy, 0] for row in curve]} for name, curve in curves.items()
-        ]
-        yield {
-            "domain": "",
-            "title": "accuracy over learning time",
-            "axis": "seconds of learning",
-            "log": True,
-            "ticks": [0.1, 1, 10, 100, 1000],
-            "lines": lines,
-        }
+        measured = {name: [[round(row.seconds, 3), row.accuracy, 0] for row in curve] for name, curve in curves.items()}
+        lines = [{"name": name, "points": points} for name, points in measured.items()]
+        title, axis, ticks = "accuracy over learning time", "seconds of learning", [0.1, 1, 10, 100, 1000]
+        yield {"domain": "", "title": title, "axis": axis, "log": True, "ticks": ticks, "lines": lines}
 
 
 def _html(content: Mapping[str, Any]) -> str:
