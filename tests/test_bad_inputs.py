@@ -12,7 +12,7 @@ import pytest
 import safetensors.torch
 import torch
 
-from ftl_lightning.data import file_format
+from ftl_lightning.data.formats import file_format
 from ftl_lightning.domains.from_file import read_demonstrations
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.evaluation.results import COLUMNS, read_rows

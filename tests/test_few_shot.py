@@ -22,7 +22,7 @@ from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.methods.ftl_igm.model import DiffusionConfig, GenerativeModel
 from ftl_lightning.services.configuration import load
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.seeding import generator
+from ftl_lightning.services.randomness import generator
 from ftl_lightning.services.tensor_file import file_hash
 from ftl_lightning.training.inversion import invert
 from ftl_lightning.training.inversion_settings import InversionSettings

@@ -33,8 +33,7 @@ from ftl_lightning.reporting.frontier import read_frontier
 from ftl_lightning.reporting.report import write_report
 from ftl_lightning.reporting.shown import domain_of
 from ftl_lightning.reporting.speed import read_speed
-from ftl_lightning.services.escape import figure_text, latex, latex_row, markdown
-from ftl_lightning.services.printing import line, plain, say
+from ftl_lightning.services.text import figure_text, latex, latex_row, line, markdown, plain, say
 from tests import conftest
 from tests.conftest import ROOT, Once, python, succeed
 from tests.study import simulated, write_films

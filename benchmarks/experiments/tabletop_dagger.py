@@ -24,7 +24,7 @@ from ftl_lightning.domains.tabletop.tasks import AROUND_BOWL, PUSH, PUSHES
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.services.progress import bar
-from ftl_lightning.services.seeding import generator, task_key
+from ftl_lightning.services.randomness import generator, task_key
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.pretrained import load_model
 

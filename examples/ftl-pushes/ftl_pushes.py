@@ -13,7 +13,7 @@ from ftl_lightning.domains import line_plots
 from ftl_lightning.domains.domain import ClosedLoop, Concepts, Domain, Frames, Metric, Plans, Split
 from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.domains.tasks import few_shot_suites
-from ftl_lightning.services.seeding import VALIDATION_SEED, generator, task_key
+from ftl_lightning.services.randomness import VALIDATION_SEED, generator, task_key
 
 PLANS = Plans(horizon=16, columns=("x", "y"), units=("m", "m"))
 WORLD = Feature(shape=(6,), state=(0, 1))  # x and y of the point, the red target and the blue target

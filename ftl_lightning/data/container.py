@@ -11,11 +11,11 @@ from torch import Tensor
 from ftl_lightning.data.features import Feature, InitialStates, Observed, take
 from ftl_lightning.data.formats.file_format import read, write
 from ftl_lightning.data.formats.file_keys import KIND, OBSERVED
-from ftl_lightning.services.data_names import written_to
 from ftl_lightning.services.errors import UserError, about, short, shown
-from ftl_lightning.services.extras import check_extra
-from ftl_lightning.services.representation import Shown, counted
+from ftl_lightning.services.files import written_to
+from ftl_lightning.services.shipped import check_extra
 from ftl_lightning.services.tensor_file import bytes_hash, serialise
+from ftl_lightning.services.text import Shown, counted
 
 
 @dataclass(frozen=True, repr=False)

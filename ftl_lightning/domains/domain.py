@@ -22,7 +22,7 @@ from ftl_lightning.domains.paper import PAPERS_METHOD, Compared, Paper
 from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.domains.tasks import Suite, training_suite
 from ftl_lightning.services.errors import UserError, short, shown
-from ftl_lightning.services.representation import Shown, counted
+from ftl_lightning.services.text import Shown, counted
 
 if TYPE_CHECKING:
     import gymnasium

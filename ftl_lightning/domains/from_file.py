@@ -36,7 +36,7 @@ from ftl_lightning.domains.domain import Concepts, Domain, Metric, Plans, Split
 from ftl_lightning.domains.hand_drawn import drawn_by_hand
 from ftl_lightning.domains.recognition import Recognition
 from ftl_lightning.services.errors import UserError, about, short
-from ftl_lightning.services.seeding import generator
+from ftl_lightning.services.randomness import generator
 
 OWN = "own"
 """Name of the domain of user data."""

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from ftl_lightning.data.container import Demonstrations, padded
 from ftl_lightning.domains.domain import Plans, Split
-from ftl_lightning.services.seeding import VALIDATION_SEED
+from ftl_lightning.services.randomness import VALIDATION_SEED
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from ftl_lightning.services.printing import line
+from ftl_lightning.services.text import line
 
 SECONDS = 4.0
 """Default duration of an animation."""

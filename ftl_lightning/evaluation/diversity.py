@@ -27,7 +27,7 @@ from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.evaluation.evaluable import demonstrations_of
 from ftl_lightning.evaluation.judged import TaskResult
 from ftl_lightning.services.progress import bar
-from ftl_lightning.services.seeding import FRESH_SEED
+from ftl_lightning.services.randomness import FRESH_SEED
 
 _LOG = logging.getLogger(__name__)
 

@@ -17,9 +17,9 @@ from ftl_lightning.evaluation.closed_loop import PlanFollower, planner, roll_out
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.services.errors import UserError, shown
-from ftl_lightning.services.representation import Shown, counted
-from ftl_lightning.services.seeding import generator
+from ftl_lightning.services.randomness import generator
 from ftl_lightning.services.tensor_file import atomic
+from ftl_lightning.services.text import Shown, counted
 from ftl_lightning.training.concept_model import ConceptModel
 
 

@@ -17,8 +17,8 @@ from ftl_lightning.evaluation.summary import OWN
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.ranges import MOST_TOGETHER, check_count, check_range
-from ftl_lightning.services.seeding import EVALUATION_SEED, generator, task_key
+from ftl_lightning.services.randomness import EVALUATION_SEED, generator, task_key
+from ftl_lightning.services.validation import MOST_TOGETHER, check_count, check_range
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from ftl_lightning.evaluation.judged import LOST, WON
 from ftl_lightning.evaluation.row import METHOD, Row
 from ftl_lightning.evaluation.summary import plain, summary_table
 from ftl_lightning.igm.point import Part, Point
-from ftl_lightning.services.printing import line
+from ftl_lightning.services.text import line
 from ftl_lightning.training.board import RESULTS
 
 HPARAMS = ".hparams"

@@ -35,14 +35,13 @@ from ftl_lightning.few_shot.tuned import ModelSettings, settings_of
 from ftl_lightning.igm.composition import Composition, space_of
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.igm.samplers import Sampling
-from ftl_lightning.services.arguments import changed, check_path, check_text, check_whole, device_named
 from ftl_lightning.services.errors import UserError, short, shown
 from ftl_lightning.services.progress import bar
-from ftl_lightning.services.ranges import LARGEST_STEP
-from ftl_lightning.services.representation import Shown
-from ftl_lightning.services.seeding import EVALUATION_SEED
+from ftl_lightning.services.randomness import EVALUATION_SEED
 from ftl_lightning.services.shipped import pretrained_folder, shipped_models, shipped_name
+from ftl_lightning.services.text import Shown
 from ftl_lightning.services.trust import vouching
+from ftl_lightning.services.validation import LARGEST_STEP, changed, check_path, check_text, check_whole, device_named
 from ftl_lightning.training.concept_check import check_concept, check_sizes
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.demonstration_check import Check, check_with, warnings_of

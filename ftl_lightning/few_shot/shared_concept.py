@@ -24,12 +24,10 @@ from ftl_lightning.igm.composition import Composition, space_of
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.igm.summary import summary
 from ftl_lightning.services.errors import UserError, short
-from ftl_lightning.services.escape import markdown
-from ftl_lightning.services.limits import read_text
-from ftl_lightning.services.printing import line
-from ftl_lightning.services.representation import counted
-from ftl_lightning.services.seeding import generator
+from ftl_lightning.services.files import read_text
+from ftl_lightning.services.randomness import generator
 from ftl_lightning.services.tensor_file import atomic, write_text
+from ftl_lightning.services.text import counted, line, markdown
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.library import CONCEPT
 

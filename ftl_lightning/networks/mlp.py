@@ -10,8 +10,8 @@ from ftl_lightning.igm.branches import Context
 from ftl_lightning.networks.conditions import condition_encoder, turned
 from ftl_lightning.networks.denoiser import Sizes, sinusoidal_embedding
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.processes import Dropout
-from ftl_lightning.services.ranges import check_range
+from ftl_lightning.services.randomness import Dropout
+from ftl_lightning.services.validation import check_range
 
 FEW = 8
 """Minimum number of rows in a product: with fewer, libraries sum in another order."""

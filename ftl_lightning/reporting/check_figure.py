@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from ftl_lightning.data.check import distances
-from ftl_lightning.services.escape import figure_text
+from ftl_lightning.services.text import figure_text
 from ftl_lightning.training.demonstration_check import Check
 
 if TYPE_CHECKING:

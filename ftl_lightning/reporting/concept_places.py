@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 
 from ftl_lightning.igm.concept import Concept
-from ftl_lightning.services.extras import check_extra
+from ftl_lightning.services.shipped import check_extra
 from ftl_lightning.training.concept_model import ConceptModel
 
 

@@ -25,7 +25,7 @@ from ftl_lightning.reporting.shown import lookup, main_omega, settings
 from ftl_lightning.reporting.speed import Measured, reached
 from ftl_lightning.reporting.table import of_method, select, summarise
 from ftl_lightning.reporting.tables import labelled, main_rows
-from ftl_lightning.services.escape import figure_text
+from ftl_lightning.services.text import figure_text
 from ftl_lightning.training.concept_model import ConceptModel
 
 LINES = ("dotted", "dashed", "dashdot", (0, (1, 4)), (0, (6, 2, 1, 2, 1, 2)), "solid")

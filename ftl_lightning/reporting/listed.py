@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from ftl_lightning.services.errors import UserError, shown
-from ftl_lightning.services.schema import from_mapping, read_json
+from ftl_lightning.services.validation import from_mapping, read_json
 
 T = TypeVar("T")
 

@@ -29,9 +29,9 @@ from ftl_lightning.reporting.speed import read_speed
 from ftl_lightning.reporting.table import Table, of_method, select
 from ftl_lightning.reporting.tables import as_learned_most, tables
 from ftl_lightning.services.errors import UserError, shown
-from ftl_lightning.services.limits import read_text
-from ftl_lightning.services.printing import say
+from ftl_lightning.services.files import read_text
 from ftl_lightning.services.tensor_file import atomic, write_text
+from ftl_lightning.services.text import say
 
 BEGIN, END = "<!-- results: begin -->", "<!-- results: end -->"
 """Lines around the text that ``report --readme`` writes."""

@@ -13,7 +13,7 @@ from ftl_lightning.domains.registry import domain_of_file, is_known
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.evaluation.judged import LOST, WON
 from ftl_lightning.services.errors import UserError, shown
-from ftl_lightning.services.printing import say
+from ftl_lightning.services.text import say
 
 TRAINING, PAPER = "training", "paper"
 """Suites that come first in reports, if a domain has them."""

@@ -10,7 +10,7 @@ from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.paper import Compared, Published
 from ftl_lightning.evaluation.judged import standard_error
 from ftl_lightning.reporting.shown import published
-from ftl_lightning.services.escape import latex, latex_row, markdown
+from ftl_lightning.services.text import latex, latex_row, markdown
 
 MISSING = "-"
 MOST_COLUMNS = 8

@@ -19,7 +19,7 @@ Interpolations such as ``${seed_everything}`` are not resolved.
 import copy
 import functools
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -28,13 +28,12 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from ftl_lightning.services.errors import UserError, short
-from ftl_lightning.services.limits import check_readable
+from ftl_lightning.services.files import check_readable
 from ftl_lightning.services.shipped import shipped
 
 DEFAULTS = "defaults"
 SECTIONS = ("fit", "invert")
 """Keys whose content applies to a single verb."""
-_OPTIONS = ("--config", "-c")
 
 
 def section_of(verb: str) -> str | None:
@@ -164,35 +163,3 @@ def _parsed(text: str) -> object:
 
 LONGEST = 200_000
 """Maximum size of a configuration file in bytes; OmegaConf bounds the expansion of aliases."""
-
-
-def configurations(arguments: Sequence[str]) -> list[str]:
-    """Configuration files of a command line, in order."""
-    return [value for _, _, value in _given(arguments)]
-
-
-def expanded(arguments: Sequence[str], verb: str = "") -> list[str]:
-    """Replace configuration files in a command line by their content from :func:`load`.
-
-    Raises:
-        UserError: as :func:`load`.
-    """
-    result = list(arguments)
-    for index, prefix, value in _given(arguments):
-        result[index] = prefix + OmegaConf.to_yaml(OmegaConf.create(load(value, verb)))
-    return result
-
-
-def _given(arguments: Sequence[str]) -> Iterator[tuple[int, str, str]]:
-    """Index of the argument, prefix and path for each configuration file.
-
-    Inline configurations (``--config '{seed_everything: 1}'``) are skipped.
-    """
-    for index, argument in enumerate(arguments):
-        option, equals, value = argument.partition("=")
-        if argument in _OPTIONS and index + 1 < len(arguments):
-            index, equals, option, value = index + 1, "", "", arguments[index + 1]
-        elif option not in _OPTIONS or not equals:
-            continue
-        if "\n" not in value and not value.lstrip().startswith("{"):
-            yield index, option + equals, value

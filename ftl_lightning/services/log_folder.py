@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.targets import check_writable_folder
+from ftl_lightning.services.files import check_writable_folder
 
 LOCK = ".running"
 """File in the folder of an active run, which locks it."""

@@ -16,9 +16,8 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.services.errors import UserError, about, short, shown
-from ftl_lightning.services.limits import MOST_HEADER, MOST_TENSORS, check_readable, raised
-from ftl_lightning.services.schema import parse_json
-from ftl_lightning.services.targets import check_file
+from ftl_lightning.services.files import MOST_HEADER, MOST_TENSORS, check_file, check_readable, raised
+from ftl_lightning.services.validation import parse_json
 
 _HEADER = "ftl_lightning"
 FORMAT = 1

@@ -17,8 +17,8 @@ from ftl_lightning.igm.concept import Concept, file_name
 from ftl_lightning.igm.point import NEW_COMPONENT, Point
 from ftl_lightning.services import log_folder
 from ftl_lightning.services.errors import UserError, short
-from ftl_lightning.services.printing import say
-from ftl_lightning.services.targets import check_writable_file
+from ftl_lightning.services.files import check_writable_file
+from ftl_lightning.services.text import say
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.data import InversionData
 from ftl_lightning.training.demonstration_check import warnings_of

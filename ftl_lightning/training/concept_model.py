@@ -16,9 +16,9 @@ from ftl_lightning.igm.point import EMPTY_CONCEPT, TRAINING_CONCEPT, Point
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.networks.image_encoder import ImageEncoders
 from ftl_lightning.services.errors import UserError, short, shown
-from ftl_lightning.services.processes import drawn
-from ftl_lightning.services.representation import Shown, counted
+from ftl_lightning.services.randomness import drawn
 from ftl_lightning.services.tensor_file import bytes_hash, serialise
+from ftl_lightning.services.text import Shown, counted
 from ftl_lightning.training.method import Method
 from ftl_lightning.training.model_config import ModelConfig, find_view
 from ftl_lightning.training.prepared import Prepared

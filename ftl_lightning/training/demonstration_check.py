@@ -11,7 +11,7 @@ from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.data.finding import Finding
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.services.progress import bar
-from ftl_lightning.services.representation import counted
+from ftl_lightning.services.text import counted
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.inversion import check_settings
 from ftl_lightning.training.inversion_settings import InversionSettings

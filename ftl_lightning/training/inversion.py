@@ -16,7 +16,7 @@ from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import Concept, Origin
 from ftl_lightning.igm.modes import Modes
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.seeding import generator, task_key
+from ftl_lightning.services.randomness import generator, task_key
 from ftl_lightning.training.adam import Group
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.inversion_settings import (

@@ -9,7 +9,7 @@ from ftl_lightning.igm.prediction import LOSSES
 from ftl_lightning.igm.schedule import LARGEST_POWER
 from ftl_lightning.services.errors import UserError, shown
 from ftl_lightning.services.option_groups import replaced
-from ftl_lightning.services.ranges import LARGEST, LARGEST_RATE, MOST_TOGETHER, check_count, check_factor, check_range
+from ftl_lightning.services.validation import LARGEST, LARGEST_RATE, MOST_TOGETHER, check_count, check_factor, check_range
 
 EXPLAINED = 0.4
 """Minimum gain of one set of embeddings, as a share of the modes' gain, to use mixtures; chosen on validation suites."""

@@ -15,9 +15,8 @@ from typing import Literal
 from ftl_lightning.igm.concept import file_name
 from ftl_lightning.igm.summary import summary
 from ftl_lightning.services.errors import UserError, short, shown
-from ftl_lightning.services.printing import line
-from ftl_lightning.services.representation import Shown, counted
 from ftl_lightning.services.tensor_file import data_folder, visible
+from ftl_lightning.services.text import Shown, counted, line
 
 Kind = Literal["training", "shipped", "saved"]
 CONCEPT = "concept.safetensors"

@@ -12,8 +12,8 @@ from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.from_file import OWN, own_domain
 from ftl_lightning.domains.registry import domain_of_file
 from ftl_lightning.services.errors import UserError, about, short
-from ftl_lightning.services.schema import from_mapping
 from ftl_lightning.services.tensor_file import alone, check_finite, file_hash, load_tensors, save_tensors, write_text
+from ftl_lightning.services.validation import from_mapping
 from ftl_lightning.training.concept_model import KIND, ConceptModel
 from ftl_lightning.training.model_config import CONFIG, VERSION, check_domain, read_config
 from ftl_lightning.training.model_weights import WEIGHTS, at_most, check_weights

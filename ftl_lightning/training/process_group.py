@@ -19,8 +19,8 @@ from lightning.pytorch.strategies.launchers import _SubprocessScriptLauncher
 from torch import distributed
 
 from ftl_lightning.services.errors import UserError, mistake_behind, mistake_of_machine, short
-from ftl_lightning.services.printing import line, say, silence
 from ftl_lightning.services.tensor_file import write_text
+from ftl_lightning.services.text import line, say, silence
 
 NOTES = "FTL_LIGHTNING_NOTES"
 """Environment variable of started processes: the folder to which they write why they end."""

@@ -14,7 +14,7 @@ from ftl_lightning.domains.distances import path_distance
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.igm.concept import Concept, QualityRecord
 from ftl_lightning.igm.samplers import Sampling
-from ftl_lightning.services.seeding import generator, task_key
+from ftl_lightning.services.randomness import generator, task_key
 from ftl_lightning.training.concept_model import ConceptModel
 
 if TYPE_CHECKING:

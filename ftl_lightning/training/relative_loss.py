@@ -10,7 +10,7 @@ from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.data.features import Observed, moved
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.samplers import Sampling
-from ftl_lightning.services.seeding import generator
+from ftl_lightning.services.randomness import generator
 from ftl_lightning.training.concept_model import ConceptModel, Draws
 from ftl_lightning.training.inversion_settings import InversionSettings
 

@@ -13,12 +13,12 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 
 from ftl_lightning.services import log_folder
 from ftl_lightning.services.errors import UserError, short
-from ftl_lightning.services.printing import silence
-from ftl_lightning.services.ranges import check_count, check_range
+from ftl_lightning.services.text import silence
+from ftl_lightning.services.validation import check_count, check_range
 from ftl_lightning.training import process_group
 from ftl_lightning.training.adaptation import Adaptation
+from ftl_lightning.training.board import LearningRate
 from ftl_lightning.training.checkpoint import WholeCheckpoints
-from ftl_lightning.training.learning_rate import LearningRate
 
 HARMLESS = {
     "accelerator",

@@ -17,7 +17,7 @@ from ftl_lightning.domains.tabletop.tasks import AROUND_BOWL, PUSH, PUSH_ON_BOOK
 from ftl_lightning.domains.tabletop.views import BLUR, HALF, MIDDLE, RAISED, VIEWS, misplaced, told
 from ftl_lightning.networks.image_encoder import ImageEncoders
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.seeding import generator
+from ftl_lightning.services.randomness import generator
 from ftl_lightning.training import PretrainingModule
 from ftl_lightning.training.data import PretrainingData
 from ftl_lightning.training.pretrained import load_model

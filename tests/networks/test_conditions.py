@@ -22,7 +22,7 @@ from ftl_lightning.networks.denoiser import Sizes
 from ftl_lightning.networks.mlp import MLPDenoiser
 from ftl_lightning.networks.temporal_unet import TemporalUNet
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.seeding import generator
+from ftl_lightning.services.randomness import generator
 from ftl_lightning.training.prepared import Prepared
 
 STEPS = 6

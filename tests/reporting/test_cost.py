@@ -14,7 +14,7 @@ from torch import nn
 
 from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
-from ftl_lightning.services.seeding import generator
+from ftl_lightning.services.randomness import generator
 from ftl_lightning.training.data import InversionData
 from ftl_lightning.training.inversion import invert
 from ftl_lightning.training.inversion_settings import InversionSettings

@@ -13,7 +13,7 @@ from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.reporting.figures import learning_time
 from ftl_lightning.reporting.speed import ONE, PUBLISHED, TEN, Measured, reached, read_speed
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.seeding import generator
+from ftl_lightning.services.randomness import generator
 from ftl_lightning.training.data import InversionData
 from ftl_lightning.training.inversion_settings import InversionSettings
 from ftl_lightning.training.model_folder import read_model

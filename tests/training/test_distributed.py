@@ -16,7 +16,7 @@ from torch.distributed import TCPStore
 
 from ftl_lightning.cli.main import main
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.processes import Dropout, drawn, rows_of
+from ftl_lightning.services.randomness import Dropout, drawn, rows_of
 from ftl_lightning.training.trainer import Trainer
 from tests import tiny as sizes
 from tests.conftest import CONF, TINY, Once, draw_once, inversion_module, refused, started, succeed

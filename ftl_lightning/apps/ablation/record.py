@@ -13,9 +13,9 @@ from ftl_lightning.apps.ablation.outcome import State
 from ftl_lightning.apps.ablation.plan import Cell
 from ftl_lightning.evaluation.summary import literal
 from ftl_lightning.services.errors import UserError, about, short
-from ftl_lightning.services.printing import line
-from ftl_lightning.services.schema import check_type, read_json
 from ftl_lightning.services.tensor_file import alone, write_text
+from ftl_lightning.services.text import line
+from ftl_lightning.services.validation import check_type, read_json
 
 KIND = "cells of an ablation"
 FORMAT = 1

@@ -21,8 +21,8 @@ from ftl_lightning.apps.ablation.record import by_node, counted, read_record, ta
 from ftl_lightning.services import log_folder
 from ftl_lightning.services.configuration import load
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.printing import say
 from ftl_lightning.services.progress import bar
+from ftl_lightning.services.text import say
 
 if TYPE_CHECKING:
     from ftl_lightning.apps.lightning_cli import CommandLine

@@ -18,7 +18,7 @@ from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.domain import ACCURACY, Concepts, Domain, Metric, Plans
 from ftl_lightning.domains.generated import Generated
 from ftl_lightning.domains.tasks import EvaluationTask, Suite, training_suite
-from ftl_lightning.services.seeding import FRESH_SEED
+from ftl_lightning.services.randomness import FRESH_SEED
 
 TEMPLATES, TEMPLATE_SEED = 80, 7_000_000
 """Number of templates per kind for judging, and their reserved seed."""

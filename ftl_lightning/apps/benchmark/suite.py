@@ -12,9 +12,9 @@ from ftl_lightning.data.container import Demonstrations, concatenate
 from ftl_lightning.domains.domain import Domain, Recoveries, Source
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.services.errors import UserError, about, short
-from ftl_lightning.services.schema import from_mapping, read_json
-from ftl_lightning.services.seeding import DEMONSTRATION_SEED, EVALUATION_SEED
+from ftl_lightning.services.randomness import DEMONSTRATION_SEED, EVALUATION_SEED
 from ftl_lightning.services.tensor_file import bytes_hash, file_hash
+from ftl_lightning.services.validation import from_mapping, read_json
 
 FOLDER = Path(__file__).parent / "suites"
 SEEDS = (0, 1, 2)

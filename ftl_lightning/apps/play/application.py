@@ -20,8 +20,8 @@ from ftl_lightning.apps.play.guard import Guard, body_of
 from ftl_lightning.apps.play.page import POLICY, page
 from ftl_lightning.apps.play.workspace import Stopped, Workspace
 from ftl_lightning.services.errors import UserError, mistake_of_machine, short
-from ftl_lightning.services.printing import line, say
-from ftl_lightning.services.schema import from_mapping, parse_json
+from ftl_lightning.services.text import line, say
+from ftl_lightning.services.validation import from_mapping, parse_json
 
 MOST_ASKED, MOST_OPENED = 4 * 2**20, 64 * 2**20
 """Maximum bytes of a request, and of an uploaded file."""

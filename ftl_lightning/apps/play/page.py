@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from ftl_lightning.services.web import FILM
+from ftl_lightning.services.shipped import FILM
 
 HERE = Path(__file__).parent
 SCRIPTS = (FILM, *(HERE / f"{name}.js" for name in ("space", "films", "ask", "record", "learn", "mix", "viewer", "page")))

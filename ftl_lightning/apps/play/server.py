@@ -14,7 +14,7 @@ from starlette.routing import Route
 
 from ftl_lightning.apps.play.application import Begin, guarded
 from ftl_lightning.services.errors import UserError, short
-from ftl_lightning.services.printing import say
+from ftl_lightning.services.text import say
 
 LOOPBACK = "127.0.0.1"
 PORT = 8765

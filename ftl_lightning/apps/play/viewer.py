@@ -14,7 +14,7 @@ from ftl_lightning.domains.from_file import OWN, read_own
 from ftl_lightning.domains.registry import domain_names, load_domain
 from ftl_lightning.igm.concept import KIND, Concept
 from ftl_lightning.services.errors import UserError, about
-from ftl_lightning.services.limits import check_readable
+from ftl_lightning.services.files import check_readable
 from ftl_lightning.services.tensor_file import kind_of, visible
 
 MOST_SHOWN, MOST_CONCEPTS = 60, 100

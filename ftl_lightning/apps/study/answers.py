@@ -8,7 +8,7 @@ from typing import Any
 from ftl_lightning.apps.study.page import FORMAT, KEY_KIND
 from ftl_lightning.apps.study.questions import BEST, CHECK, DEPICTS, NO, REPEAT, YES
 from ftl_lightning.services.errors import UserError, short, shown
-from ftl_lightning.services.schema import read_json
+from ftl_lightning.services.validation import read_json
 
 ANSWERS_KIND = "study answers"
 REPEATS_THAT_MAY_DIFFER = 0.5

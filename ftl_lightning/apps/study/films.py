@@ -11,8 +11,8 @@ from torch import Tensor
 from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.services.errors import UserError, short, shown
-from ftl_lightning.services.schema import read_json
 from ftl_lightning.services.tensor_file import file_hash, visible
+from ftl_lightning.services.validation import read_json
 
 LISTING = "films.json"
 TRAINING, NEW = "training", "new"

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ftl_lightning.apps.study.films import CHECKS, Film
-from ftl_lightning.services.printing import line
+from ftl_lightning.services.text import line
 
 YES, NO = "yes", "no"
 DEPICTS, BEST = "depicts", "best"

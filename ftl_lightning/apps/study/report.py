@@ -16,7 +16,7 @@ from ftl_lightning.apps.study.films import NEW, TRAINING
 from ftl_lightning.apps.study.questions import BEST, DEPICTS, YES
 from ftl_lightning.evaluation.summary import literal
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.printing import line
+from ftl_lightning.services.text import line
 
 LABELS = {BEST: "judged best", DEPICTS: "depicts the concept"}
 """Labels of the questions, in the order of the paper's table."""

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ftl_lightning.apps.testing.strokes import NEW, SHAPES, STEPS, TRAINING, Points, corners, polar
-from ftl_lightning.services.seeding import task_key
+from ftl_lightning.services.randomness import task_key
 
 TEMPLATES = 100
 """Default number of templates per kind of :class:`Judge`."""

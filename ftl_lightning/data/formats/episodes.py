@@ -15,7 +15,7 @@ from torch import Tensor
 from ftl_lightning.data.container import Demonstrations, padded
 from ftl_lightning.data.formats.file_format import Contents
 from ftl_lightning.services.errors import UserError, short
-from ftl_lightning.services.limits import VARIABLE, most_bytes
+from ftl_lightning.services.files import VARIABLE, most_bytes
 
 
 @dataclass(frozen=True)

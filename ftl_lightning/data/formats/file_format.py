@@ -11,11 +11,11 @@ from ftl_lightning.data.features import Observed
 from ftl_lightning.data.formats.file_keys import KIND, OBSERVED, TEXTS
 from ftl_lightning.data.formats.images import compressed, decompressed_images
 from ftl_lightning.data.formats.npz import read_npz, write_npz
-from ftl_lightning.services.data_names import read_from
 from ftl_lightning.services.errors import UserError, about, short, shown
-from ftl_lightning.services.extras import check_extra
-from ftl_lightning.services.schema import check_type
+from ftl_lightning.services.files import read_from
+from ftl_lightning.services.shipped import check_extra
 from ftl_lightning.services.tensor_file import load_tensors, save_tensors
+from ftl_lightning.services.validation import check_type
 
 VERSION = 4
 """Version of the file format. Images are compressed (zlib) to 1-D uint8; the header has their shapes by key as ``compressed``."""

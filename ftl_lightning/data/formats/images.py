@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ftl_lightning.data.formats.file_keys import OBSERVED
 from ftl_lightning.services.errors import UserError, about, short, shown
-from ftl_lightning.services.limits import check_unpacked
+from ftl_lightning.services.files import check_unpacked
 
 MOST_SHRUNK = 1032
 """Maximum compression ratio of zlib."""

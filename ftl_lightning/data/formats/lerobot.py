@@ -25,12 +25,11 @@ from numpy.typing import NDArray
 from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.data.formats.episodes import Beside, Episode, contents
 from ftl_lightning.data.formats.file_format import Contents
-from ftl_lightning.services.data_names import INFO
 from ftl_lightning.services.errors import UserError, about, short, shown
-from ftl_lightning.services.limits import MOST_TENSORS, MOST_TEXT, check_readable, check_unpacked, read_text
-from ftl_lightning.services.printing import line, say
-from ftl_lightning.services.schema import check_type, from_mapping, parse_json, read_json
+from ftl_lightning.services.files import INFO, MOST_TENSORS, MOST_TEXT, check_readable, check_unpacked, read_text
 from ftl_lightning.services.tensor_file import visible
+from ftl_lightning.services.text import line, say
+from ftl_lightning.services.validation import check_type, from_mapping, parse_json, read_json
 
 STATE = "observation.state"
 """Feature that holds the states."""

@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.data.formats.episodes import Episode, beside, check_names, episodes
 from ftl_lightning.data.formats.lerobot import ACTION, BESIDE, EPISODE, LENGTH, OBSERVED, SCENE, STATE, TASK, VERSIONS
-from ftl_lightning.services.data_names import INFO
 from ftl_lightning.services.errors import UserError, shown
-from ftl_lightning.services.targets import check_new_folder
+from ftl_lightning.services.files import INFO, check_new_folder
 
 _QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 _DATA = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"

@@ -25,7 +25,7 @@ from ftl_lightning.data.formats.episodes import Beside, Episode, beside, check_n
 from ftl_lightning.data.formats.file_format import Contents
 from ftl_lightning.data.observations import PART, feature_parts, states_part
 from ftl_lightning.services.errors import UserError, about, short
-from ftl_lightning.services.schema import from_mapping
+from ftl_lightning.services.validation import from_mapping
 
 CONCEPT = "concept"
 """Key of an episode's text, see this module."""

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ftl_lightning.data.formats.file_keys import OBSERVED, TEXTS
 from ftl_lightning.services.errors import UserError, about, short
-from ftl_lightning.services.limits import MOST_TENSORS, check_readable, check_unpacked
+from ftl_lightning.services.files import MOST_TENSORS, check_readable, check_unpacked
 from ftl_lightning.services.tensor_file import atomic
 
 _DAMAGED = (OSError, ValueError, EOFError, AttributeError, TypeError, RuntimeError, LookupError, MemoryError, SyntaxError)

@@ -24,7 +24,7 @@ from ftl_lightning.domains.domain import ACCURACY, ClosedLoop, Concepts, Domain,
 from ftl_lightning.domains.paper import Paper
 from ftl_lightning.domains.recorder import Recorder
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.seeding import VALIDATION_SEED
+from ftl_lightning.services.randomness import VALIDATION_SEED
 
 if TYPE_CHECKING:
     from ftl_lightning.domains.agent.environment import AgentEnvironment

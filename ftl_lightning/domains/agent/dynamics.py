@@ -1,7 +1,7 @@
 """Constants of the physics."""
 
 from ftl_lightning.domains.agent.scenes import HEIGHT
-from ftl_lightning.services.extras import check_extra
+from ftl_lightning.services.shipped import check_extra
 
 STEP = 0.05
 """Seconds between states."""

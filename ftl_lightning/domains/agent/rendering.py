@@ -13,7 +13,7 @@ from ftl_lightning.domains.agent.dynamics import check_simulator
 from ftl_lightning.domains.agent.scenes import COLOURS, OBSERVED, PLANE, REACH, looks, object_positions
 from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.domains.vector_film import Shape, VectorFilm, regular, some, still
-from ftl_lightning.services.escape import figure_text
+from ftl_lightning.services.text import figure_text
 
 MARKERS = {"cone": "^", "sphere": "o", "bowl": "v", "cube": "s"}
 """Markers; a bowl is an open triangle pointing down."""

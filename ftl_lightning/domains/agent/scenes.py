@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ftl_lightning.data.features import Feature
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.seeding import task_key
+from ftl_lightning.services.randomness import task_key
 
 COLOURS = {"red": (255, 87, 34), "yellow": (217, 191, 119), "purple": (149, 56, 158), "green": (148, 252, 19)}
 """RGB colours of the paper, 0 to 255."""

@@ -15,7 +15,7 @@ from ftl_lightning.domains.driving.shipped import training_set
 from ftl_lightning.domains.driving.tasks import TRAINING_CONCEPTS
 from ftl_lightning.domains.driving.traffic import STATE, TRAFFIC, check_simulator, origin
 from ftl_lightning.domains.driving.views import VIEWS
-from ftl_lightning.services.seeding import generator
+from ftl_lightning.services.randomness import generator
 
 if TYPE_CHECKING:
     from highway_env.envs.common.abstract import AbstractEnv

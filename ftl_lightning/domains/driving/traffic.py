@@ -8,7 +8,7 @@ from torch import Tensor
 
 from ftl_lightning.data.features import Feature, InitialStates
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.extras import check_extra
+from ftl_lightning.services.shipped import check_extra
 
 NAME = "driving"
 HORIZON = 8

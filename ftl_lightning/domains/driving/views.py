@@ -8,7 +8,7 @@ from ftl_lightning.domains.domain import View
 from ftl_lightning.domains.driving.motion import drive, speed, turn, turned, way
 from ftl_lightning.domains.driving.tasks import TRAINING_CONCEPTS
 from ftl_lightning.domains.driving.traffic import FEATURES_SEEN, NAMES, SCENARIO, STATE, TRAFFIC, VEHICLES, decision_seconds
-from ftl_lightning.services.processes import drawn
+from ftl_lightning.services.randomness import drawn
 
 SECONDS = torch.tensor([decision_seconds(name) for name in NAMES])
 """Seconds between decisions by scenario number."""

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ftl_lightning.services.errors import UserError, short
-from ftl_lightning.services.limits import read_text
+from ftl_lightning.services.files import read_text
 
 Numbers = NDArray[np.float64]
 END = "EndSite"

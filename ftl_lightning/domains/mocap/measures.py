@@ -19,7 +19,7 @@ from ftl_lightning.domains.mocap.features import extremes
 from ftl_lightning.domains.mocap.judge import PARTS, WHOLE, Judge, shipped_judge
 from ftl_lightning.domains.mocap.skeleton import BONES, RIGID, SHOULDERS, WRISTS, as_joints, bone_lengths
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.extras import check_extra
+from ftl_lightning.services.shipped import check_extra
 
 POSE = "pose"
 """Observed feature of the initial pose."""

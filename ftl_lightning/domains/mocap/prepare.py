@@ -22,10 +22,10 @@ from ftl_lightning.domains.mocap.skeleton import HORIZON, JOINTS, RIGID
 from ftl_lightning.domains.mocap.source import glitches, left_out, pieces, too_short
 from ftl_lightning.domains.mocap.tasks import HELD_OUT, TRAINING_CONCEPTS, cleaned
 from ftl_lightning.services.errors import UserError, short
-from ftl_lightning.services.limits import MOST_TEXT, check_readable
+from ftl_lightning.services.files import MOST_TEXT, check_readable
 from ftl_lightning.services.progress import bar
-from ftl_lightning.services.representation import counted
 from ftl_lightning.services.tensor_file import write_text
+from ftl_lightning.services.text import counted
 
 REPORT = "recordings.json"
 LEFT_OUT = "left out of pretraining"

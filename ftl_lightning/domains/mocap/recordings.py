@@ -19,7 +19,7 @@ from ftl_lightning.domains.mocap.segments import SEGMENTS, Segment, read_segment
 from ftl_lightning.domains.mocap.skeleton import JOINTS
 from ftl_lightning.domains.mocap.tasks import cleaned
 from ftl_lightning.services.errors import UserError, short
-from ftl_lightning.services.limits import check_readable
+from ftl_lightning.services.files import check_readable
 from ftl_lightning.services.tensor_file import atomic
 
 FILE = "recordings.npz"

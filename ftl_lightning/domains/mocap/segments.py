@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.limits import read_text
+from ftl_lightning.services.files import read_text
 
 SEGMENTS = "segments.csv"
 HEADER = ("trial_id", "label", "start30", "stop30")

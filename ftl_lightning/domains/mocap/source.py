@@ -21,7 +21,7 @@ from ftl_lightning.domains.mocap.skeleton import COLUMNS, FPS, HORIZON, as_joint
 from ftl_lightning.domains.mocap.standing import standing_poses, walking_poses
 from ftl_lightning.domains.mocap.tasks import DEMONSTRATORS, HELD_OUT, NEW_CONCEPTS, TRAINING_CONCEPTS, mirrored_text
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.seeding import generator, task_key
+from ftl_lightning.services.randomness import generator, task_key
 
 NAME = "mocap"
 POSE = "pose"

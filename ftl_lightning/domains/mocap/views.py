@@ -11,7 +11,7 @@ from ftl_lightning.domains.domain import View
 from ftl_lightning.domains.mocap.skeleton import L_HIP, R_HIP, RIGID, as_joints
 from ftl_lightning.domains.mocap.source import OBSERVED, POSE
 from ftl_lightning.domains.mocap.standing import drawn_poses
-from ftl_lightning.services.processes import drawn
+from ftl_lightning.services.randomness import drawn
 
 SHORTEST = 1e-3
 """Minimum length in metres of a generated bone with a direction; shorter bones are not changed."""

@@ -16,7 +16,7 @@ from ftl_lightning.domains.object_rearrangement.relations import (
     parse,
 )
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.seeding import task_key
+from ftl_lightning.services.randomness import task_key
 
 SIZE = (0.3, 1.0)
 """Range of a shape's radius (paper)."""

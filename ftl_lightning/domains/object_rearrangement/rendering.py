@@ -12,7 +12,7 @@ from torch import Tensor
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.object_rearrangement.relations import EXTENT, PER_SHAPE, SHAPES
 from ftl_lightning.domains.vector_film import VectorFilm, regular, still
-from ftl_lightning.services.escape import figure_text
+from ftl_lightning.services.text import figure_text
 
 COLOURS = {"circle": "#e4704a", "triangle": "#4c9f70", "square": "#4a78c8"}
 CORNERS = {"triangle": 3, "square": 4}

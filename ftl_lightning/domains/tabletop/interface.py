@@ -2,7 +2,7 @@
 
 from ftl_lightning.data.features import Feature
 from ftl_lightning.domains.tabletop.world import OVERHEAD
-from ftl_lightning.services.extras import check_extra
+from ftl_lightning.services.shipped import check_extra
 
 NAME, WIDE_NAME = "tabletop", "tabletop_wide"
 STATE_NAMES = ("hand.x", "hand.y", "hand.z", "gripper.opening")

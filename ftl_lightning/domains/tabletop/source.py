@@ -21,7 +21,7 @@ from ftl_lightning.domains.tabletop.interface import FEATURES, IMAGE, NAME, PLAC
 from ftl_lightning.domains.tabletop.scenes import draw_scene, scenes
 from ftl_lightning.domains.tabletop.tasks import PUSH, PUSHES, TRAINING_CONCEPTS, check_task
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.seeding import VALIDATION_SEED, task_key
+from ftl_lightning.services.randomness import VALIDATION_SEED, task_key
 
 _LOG = logging.getLogger(__name__)
 

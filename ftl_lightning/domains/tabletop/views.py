@@ -11,7 +11,7 @@ from ftl_lightning.data.features import Feature, Observed
 from ftl_lightning.domains.domain import View
 from ftl_lightning.domains.tabletop.interface import FEATURES, IMAGE, PLACES, POSE
 from ftl_lightning.domains.tabletop.world import OVERHEAD
-from ftl_lightning.services.processes import drawn
+from ftl_lightning.services.randomness import drawn
 
 HAND, POINTS, MOVED = "hand", "points", "moved"
 ORIGIN = "origin"

@@ -10,7 +10,7 @@ from ftl_lightning.data.features import Observed
 from ftl_lightning.igm.composition import Composition, batched
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.methods.bc import METHOD
-from ftl_lightning.services.ranges import check_range
+from ftl_lightning.services.validation import check_range
 from ftl_lightning.training.additive import AdditiveModel, added
 from ftl_lightning.training.prepared import Prepared
 from ftl_lightning.training.text_concept_model import TextConceptModel

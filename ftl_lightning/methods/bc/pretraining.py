@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.methods.bc.model import CloningConfig, CloningModel
-from ftl_lightning.services.ranges import check_range
+from ftl_lightning.services.validation import check_range
 from ftl_lightning.training.data import Batch, PretrainingData
 from ftl_lightning.training.model_config import ModelConfig
 from ftl_lightning.training.prepared import Prepared

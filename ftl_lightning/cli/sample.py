@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from ftl_lightning.services.printing import say
-from ftl_lightning.services.ranges import check_count, check_range
+from ftl_lightning.services.text import say
+from ftl_lightning.services.validation import check_count, check_range
 
 if TYPE_CHECKING:
     from ftl_lightning.data.features import InitialStates
@@ -76,7 +76,7 @@ class SampleOptions:
 
 
 def sample(options: SampleOptions) -> None:
-    """Generate behaviour; write, judge, draw and execute it."""
+    """Generate behaviour as in ``options``; write, judge, draw and execute it."""
     from dataclasses import replace
 
     from ftl_lightning.evaluation.animation import captioned, gif
@@ -157,7 +157,7 @@ def _export_files(export: str, count: int) -> list[Path]:
     Raises:
         UserError: before sampling, if an existing path is not a file.
     """
-    from ftl_lightning.services.targets import check_file
+    from ftl_lightning.services.files import check_file
 
     if not export:
         return []

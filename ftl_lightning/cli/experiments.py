@@ -1,12 +1,14 @@
-"""The verb ``benchmark`` and its options. Imports are deferred for a fast start."""
+"""Verbs for experiments: ``benchmark``, ``ablate``, ``report``. Imports are local, for a fast start."""
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
-from ftl_lightning.services.errors import UserError, short
-from ftl_lightning.services.printing import line, say
+from ftl_lightning.apps.ablation import Stage
+from ftl_lightning.services.errors import UserError, require, short
+from ftl_lightning.services.text import line, say
+from ftl_lightning.services.validation import check_count
 
 if TYPE_CHECKING:
     from ftl_lightning.apps.benchmark.run import Entry
@@ -85,7 +87,7 @@ def _entry(options: BenchmarkOptions, work: Path) -> "Entry":
 
 
 def benchmark(options: BenchmarkOptions) -> None:
-    """Run the verb."""
+    """Run a method, or list, check, rank or write what the ``options`` ask for instead."""
     if options.list:
         from ftl_lightning.apps.benchmark.leaderboard import suite_table
 
@@ -94,8 +96,8 @@ def benchmark(options: BenchmarkOptions) -> None:
         _check(options)
     elif options.leaderboard:
         from ftl_lightning.apps.benchmark.leaderboard import leaderboard, read_submissions
-        from ftl_lightning.services.representation import counted
         from ftl_lightning.services.tensor_file import write_text
+        from ftl_lightning.services.text import counted
 
         submissions = read_submissions(Path(options.submissions))
         write_text(Path(options.leaderboard), leaderboard(submissions))
@@ -107,12 +109,10 @@ def benchmark(options: BenchmarkOptions) -> None:
         for name in _chosen(options):
             written = write_data(load_suite(name), _numbers(options), Path(options.data), options.format, _root(options))
             say(f"{Path(options.data) / name}: {len(written)} files")
-    elif options.method:
-        _run(options)
     else:
-        raise UserError(
-            "method: expected the name of a method, such as ftl_igm, or --list, --check, --leaderboard or --data, found none"
-        )
+        expected = "the name of a method, such as ftl_igm, or --list, --check, --leaderboard or --data"
+        require(options.method, "method", expected, "none")
+        _run(options)
 
 
 def _named(text: str, key: str) -> list[str]:
@@ -160,8 +160,8 @@ def _run(options: BenchmarkOptions) -> None:
     from ftl_lightning.apps.benchmark.run import run_benchmark
     from ftl_lightning.apps.benchmark.submission import Submission, machine
     from ftl_lightning.apps.benchmark.suite import SEEDS, load_suite
-    from ftl_lightning.services.representation import counted
-    from ftl_lightning.services.targets import check_writable_file
+    from ftl_lightning.services.files import check_writable_file
+    from ftl_lightning.services.text import counted
     from ftl_lightning.training.methods import code_hash, load_method
 
     out = Path(options.out)
@@ -216,7 +216,7 @@ def _resumed(known: "Submission", begun: "Submission", out: Path) -> "Submission
 
 def _check(options: BenchmarkOptions) -> None:
     from ftl_lightning.apps.benchmark.check import check_submission, recompute
-    from ftl_lightning.services.representation import counted
+    from ftl_lightning.services.text import counted
 
     path = Path(options.check)
     if (options.salt or options.recompute != BenchmarkOptions.recompute) and not options.method:
@@ -235,3 +235,86 @@ def _check(options: BenchmarkOptions) -> None:
         say(line(f"differs: {difference}"))
     if differences:
         raise UserError(f"{path}: expected the submitted numbers, found {len(differences)} that differ; see above")
+
+
+MOST_WORKERS = 1000
+"""Maximum number of parallel cells."""
+
+
+@dataclass(frozen=True)
+class AblateOptions:
+    """Run every cell of an ablation that is not in the results.
+
+    Attributes:
+        stages: verbs with grids of options, in order.
+        results: results file to which rows are added.
+        seeds: each stage runs once per seed.
+        shard: "3/8" for the third of eight parts; models that it does not make itself must exist.
+        executor: "ray" (the extra "cluster") runs cells in parallel on a Ray cluster, or on this machine's processors.
+        root: folder of recordings, for domains that read one: data.root of every cell.
+        address: address of the Ray cluster's head, HOST:PORT; empty for RAY_ADDRESS, or else a cluster on this machine.
+        only: numbers of the stages to run, from 1; empty for all.
+        estimate: run nothing; print the number of cells to run and the estimated hours.
+        status: run nothing; print the table of cells with their states, also while another process runs them.
+        slurm: run nothing; write a script for Slurm's sbatch to this file, or several in order, whose jobs run shards.
+        workers: parallel cells, for the estimate; jobs of each Slurm array (0: a job per cell).
+        sbatch: more options of sbatch by name, such as {partition: long, time: "02:00:00"}.
+    """
+
+    stages: list[Stage]
+    results: str
+    seeds: list[int] = field(default_factory=lambda: [0])
+    shard: str = "1/1"
+    executor: Literal["local", "ray"] = "local"
+    root: str = ""
+    address: str = ""
+    only: list[int] = field(default_factory=list)
+    estimate: bool = False
+    status: bool = False
+    slurm: str = ""
+    workers: int = 0
+    sbatch: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        check_count("workers", self.workers, 0, MOST_WORKERS)
+
+
+def ablate(options: AblateOptions) -> None:
+    """Run the cells, or print or write what the options ask for instead."""
+    from ftl_lightning.apps.ablation.run import planned, run_ablation, show_cells, show_estimate
+
+    stages, seeds, results = options.stages, options.seeds, options.results
+    if not (options.estimate or options.status or options.slurm):
+        return run_ablation(stages, seeds, results, options.shard, options.executor, options.root, options.address, options.only)
+    plan = planned(stages, seeds, options.root, options.only)
+    if options.estimate:
+        show_estimate(list(plan.values()), results, options.workers)
+    if options.status:
+        show_cells(results, [cell for cells in plan.values() for cell in cells])
+    if options.slurm:
+        from ftl_lightning.apps.ablation.check import check
+        from ftl_lightning.apps.ablation.slurm import write_scripts
+
+        check([cell for cells in plan.values() for cell in cells])
+        keys = {"results": results, "seeds": list(seeds), "root": options.root}
+        say("\n".join(write_scripts(options.slurm, stages, plan, keys, options.workers, options.sbatch)))
+
+
+def report(results: str = "results", out: str = "results/report", readme: str = "", html: str = "") -> None:
+    """Make tables and figures from results, with the paper's numbers; or an HTML page.
+
+    Args:
+        results: a results file, or a folder of results files.
+        out: folder for Markdown, LaTeX and figures.
+        readme: a Markdown file to update between its marks.
+        html: HTML file to write instead: overview, films, concepts and curves, without a network.
+    """
+    if html:
+        from ftl_lightning.reporting.html.page import write_page
+
+        say(f"{html}: {write_page(Path(results), Path(html)) / 1e6:.1f} MB")
+        return
+    from ftl_lightning.reporting.report import write_report
+
+    say(write_report(Path(results), Path(out), Path(readme) if readme else None))
+    say(f"written to {out}")
