@@ -26,10 +26,9 @@ from ftl_lightning.services.configuration import parts
 from ftl_lightning.services.errors import UserError, mistake_behind, short
 from ftl_lightning.services.text import say
 from ftl_lightning.services.validation import check_range
-from ftl_lightning.training import process_group
 from ftl_lightning.training.board import TrainingBar, accuracies
 from ftl_lightning.training.checkpoint import last_checkpoint, read_checkpoint
-from ftl_lightning.training.trainer import Trainer
+from ftl_lightning.training.trainer import Trainer, one_voice
 
 
 class CommandLine(LightningCLI):
@@ -247,14 +246,14 @@ class _Parser(CommandLine):
 
 def run(verb: str, arguments: Arguments) -> None:
     """Parse and run one of Lightning's verbs or ``invert``."""
-    with process_group.one_voice(), log_folder.run():
+    with one_voice(), log_folder.run():
         _command_line(CommandLine, verb, arguments, run=True)
 
 
 def build(verb: str, options: list[str]) -> CommandLine:
     """Parse the options of ``fit`` or ``invert`` and build trainer, model and data without running anything."""
     line = _command_line(_Inversion if verb == "invert" else _Fit, verb, Arguments.read(options), run=False)
-    process_group.check_alone(line.trainer, "what another program runs")  # other processes would repeat its command line
+    line.trainer.check_alone("what another program runs")  # other processes would repeat its command line
     return line
 
 
@@ -296,6 +295,7 @@ def _command_line(kind: type[CommandLine], verb: str, arguments: Arguments, run:
     warnings.filterwarnings("ignore", message=".*`isinstance.treespec, LeafSpec.` is deprecated.*")  # within Lightning
     for name in ("lightning.pytorch", "lightning.fabric"):  # advice and advertisements; warnings and errors stay
         logging.getLogger(name).setLevel(logging.WARNING)
+    logging.getLogger("lightning.fabric.strategies.launchers").setLevel(logging.INFO)  # reports a process that ended early
     try:
         return kind(
             pl.LightningModule,

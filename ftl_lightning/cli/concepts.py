@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ftl_lightning.services.errors import about, require, short
 from ftl_lightning.services.text import line, say
 from ftl_lightning.services.validation import LARGEST_STEP, check_count, check_range
 
@@ -49,7 +50,6 @@ def invert(options: InvertOptions) -> None:
     from ftl_lightning.domains.from_file import read_own
     from ftl_lightning.few_shot.learner import FewShot
     from ftl_lightning.igm.concept import file_name
-    from ftl_lightning.services.errors import about, require, short
     from ftl_lightning.services.files import check_writable_file
 
     model = FewShot.from_pretrained(options.pretrained, options.settings or None)
@@ -91,7 +91,6 @@ def concepts(pretrained: str, folder: list[str] = [], plain: bool = False) -> No
         folder: more folders with learned concepts; may be given several times.
         plain: list the training concepts alone.
     """
-    from ftl_lightning.services.errors import about
     from ftl_lightning.services.shipped import pretrained_folder
     from ftl_lightning.services.validation import check_type
     from ftl_lightning.training.model_config import CONFIG, read_config

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ftl_lightning.services.errors import UserError, about, require
 from ftl_lightning.services.text import line, say
 from ftl_lightning.services.validation import check_count, check_range
 
@@ -70,11 +71,9 @@ def encode(domain: str, encoder: str = "minilm", revision: str = "main", out: st
     """
     from ftl_lightning.domains.registry import load_domain
     from ftl_lightning.networks.text_encoder import load_encoder, write_table
-    from ftl_lightning.services.errors import UserError
 
     concepts = load_domain(domain).concepts
-    if not out and concepts.table is None:
-        raise UserError(f"out: expected a file to write, found none: domain {domain} names no table of its own")
+    require(out or concepts.table, "out", "a file to write", f"none: domain {domain} names no table of its own")
     path = Path(out) if out else Path(str(concepts.table))
     write_table(path, load_encoder(encoder, concepts.table, revision), concepts.descriptions)
     say(path)
@@ -92,7 +91,6 @@ def prepare(domain: str, root: str = "", out: str = "") -> None:
         UserError: for a domain whose demonstrations need no preparation.
     """
     from ftl_lightning.domains.registry import load_domain
-    from ftl_lightning.services.errors import UserError
 
     loaded = load_domain(domain)
     if loaded.prepare is None:
@@ -120,14 +118,10 @@ class CheckOptions:
     settings: str = ""
 
     def __post_init__(self) -> None:
-        from ftl_lightning.services.errors import UserError
-
-        if self.figure and Path(self.figure).suffix not in (".png", ".svg", ".pdf"):
-            raise UserError(f"figure: expected a name that ends in .png or .svg or .pdf, found {self.figure!r}")
-        if not self.pretrained:
-            for name in ("learn", "settings"):
-                if getattr(self, name):
-                    raise UserError(f"{name}: expected --pretrained MODEL beside it, found no model")
+        picture = not self.figure or Path(self.figure).suffix in (".png", ".svg", ".pdf")
+        require(picture, "figure", "a name that ends in .png or .svg or .pdf", repr(self.figure))
+        for name, value in (("learn", self.learn), ("settings", self.settings)):
+            require(self.pretrained or not value, name, "--pretrained MODEL beside it", "no model")
 
 
 def check(options: CheckOptions) -> None:
@@ -156,8 +150,6 @@ def check(options: CheckOptions) -> None:
 
 
 def _fitting(model: "FewShot", demonstrations: "Demonstrations", path: str) -> "Demonstrations":
-    from ftl_lightning.services.errors import about
-
     with about(path):
         return model.demonstrations(demonstrations, name=Path(path).stem)
 

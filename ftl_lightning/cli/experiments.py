@@ -58,16 +58,14 @@ class BenchmarkOptions:
     format: str = "npz"
 
     def __post_init__(self) -> None:
-        if not 0 <= self.recompute <= 1:
-            raise UserError(f"recompute: expected a share from 0 to 1, found {self.recompute}")
-        if given := [f"--{name}" for name in ("list", "check", "leaderboard", "data") if getattr(self, name)][1:]:
-            raise UserError(
-                f"benchmark: expected one of --list, --check, --leaderboard and --data, found {given[0]} beside another"
-            )
-        if not re.fullmatch(r"\d{1,9}(,\d{1,9})*", self.seeds) or len(set(self.seeds.split(","))) <= self.seeds.count(","):
-            raise UserError(
-                f"seeds: expected different numbers with commas between them, such as 0,1,2, found {short(self.seeds)!r}"
-            )
+        require(0 <= self.recompute <= 1, "recompute", "a share from 0 to 1", self.recompute)
+        modes = {"list": self.list, "check": self.check, "leaderboard": self.leaderboard, "data": self.data}
+        given = [f"--{name}" for name, value in modes.items() if value]
+        expected = "one of --list, --check, --leaderboard and --data"
+        require(len(given) < 2, "benchmark", expected, f"{''.join(given[1:2])} beside another")
+        different = len(set(self.seeds.split(","))) > self.seeds.count(",")
+        valid = different and re.fullmatch(r"\d{1,9}(,\d{1,9})*", self.seeds)
+        require(valid, "seeds", "different numbers with commas between them, such as 0,1,2", repr(short(self.seeds)))
 
 
 def _numbers(options: BenchmarkOptions) -> list[int]:
@@ -124,10 +122,9 @@ def _named(text: str, key: str) -> list[str]:
     from ftl_lightning.apps.benchmark.suite import suite_names
 
     names = [name.strip() for name in text.split(",") if name.strip()]
-    if unknown := [name for name in names if name not in suite_names()]:
-        raise UserError(f"{key}: expected some of {', '.join(suite_names())}, found {short(unknown[0])!r}")
-    if len(set(names)) < len(names):
-        raise UserError(f"{key}: expected each suite once, found {short(text)!r}")
+    for name in names:
+        require(name in suite_names(), key, f"some of {', '.join(suite_names())}", repr(short(name)))
+    require(len(set(names)) == len(names), key, "each suite once", repr(short(text)))
     return names
 
 
@@ -151,8 +148,7 @@ def _chosen(options: BenchmarkOptions) -> list[str]:
             raise UserError(missing)
         else:
             say(line(f"note: left out: {missing}"), error=True)
-    if not chosen:
-        raise UserError("suites: expected one or more, found none that can be run here")
+    require(chosen, "suites", "one or more", "none that can be run here")
     return chosen
 
 
@@ -180,8 +176,9 @@ def _run(options: BenchmarkOptions) -> None:
     if out.is_file():
         begun = _resumed(Submission.load(out), begun, out)
         say(f"{out}: {counted(len(begun.runs), 'run')} kept")
-    elif work.exists():
-        raise UserError(f"{work}: expected no models and logs of another run, found some; remove the folder or give another --out")
+    else:
+        advice = "some; remove the folder or give another --out"
+        require(not work.exists(), str(work), "no models and logs of another run", advice)
     entry = _entry(options, work)
     for name in names:  # report mistakes early
         entry.cells(load_suite(name), _numbers(options)[0])
@@ -205,11 +202,11 @@ def _resumed(known: "Submission", begun: "Submission", out: Path) -> "Submission
     from dataclasses import replace
 
     for key in ("kind", "format", "method", "name", "code", "version", "machine"):
-        if getattr(known, key) != getattr(begun, key):
-            raise UserError(f"{out}: expected a submission of the same {key}, found another; give --out another file")
+        equal = getattr(known, key) == getattr(begun, key)
+        require(equal, str(out), f"a submission of the same {key}", "another; give --out another file")
     for name in set(known.suites) & set(begun.suites):
-        if known.suites[name] != begun.suites[name]:
-            raise UserError(f"{out}: suite {name}: expected the hash {begun.suites[name]}, found another; give --out another file")
+        equal = known.suites[name] == begun.suites[name]
+        require(equal, f"{out}: suite {name}", f"the hash {begun.suites[name]}", "another; give --out another file")
     seeds = [*known.seeds, *(seed for seed in begun.seeds if seed not in known.seeds)]
     return replace(known, suites={**known.suites, **begun.suites}, seeds=sorted(seeds))
 
@@ -219,8 +216,9 @@ def _check(options: BenchmarkOptions) -> None:
     from ftl_lightning.services.text import counted
 
     path = Path(options.check)
-    if (options.salt or options.recompute != BenchmarkOptions.recompute) and not options.method:
-        raise UserError("recompute: expected the installed method, too: ftl-lightning benchmark METHOD --check FILE, found none")
+    if options.salt or options.recompute != BenchmarkOptions.recompute:
+        command = "ftl-lightning benchmark METHOD --check FILE"
+        require(options.method, "recompute", f"the installed method, too: {command}", "none")
     submission, suites = check_submission(path)
     rows = sum(len(run.rows) for run in submission.runs)
     counts = f"{counted(len(suites), 'suite')}, {counted(len(submission.runs), 'run')}, {counted(rows, 'row')}"
@@ -233,8 +231,7 @@ def _check(options: BenchmarkOptions) -> None:
     differences = recompute(_entry(options, Path()), submission, suites, options.recompute, options.salt)
     for difference in differences:
         say(line(f"differs: {difference}"))
-    if differences:
-        raise UserError(f"{path}: expected the submitted numbers, found {len(differences)} that differ; see above")
+    require(not differences, str(path), "the submitted numbers", f"{len(differences)} that differ; see above")
 
 
 MOST_WORKERS = 1000

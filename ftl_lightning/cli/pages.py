@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ftl_lightning.services.errors import require
 from ftl_lightning.services.text import say
 from ftl_lightning.services.validation import check_count, check_range
 
@@ -41,13 +42,10 @@ class PlayOptions:
     browser: bool = True
 
     def __post_init__(self) -> None:
-        from ftl_lightning.services.errors import UserError
-
         check_range("port", self.port, 0, LARGEST_PORT)
-        if self.pairs and not self.static:
-            raise UserError("pairs: expected --static FOLDER beside it, found none")
-        if bad := [pair for pair in self.pairs if len(pair.split(" + ")) != 2]:
-            raise UserError(f"pairs: expected two concepts each, such as 'walk + run', found {bad[0]!r}")
+        require(self.static or not self.pairs, "pairs", "--static FOLDER beside it", "none")
+        for pair in self.pairs:
+            require(pair.count(" + ") == 1, "pairs", "two concepts each, such as 'walk + run'", repr(pair))
 
 
 def play(options: PlayOptions) -> None:
@@ -81,7 +79,6 @@ def _write_static(workspace: "Workspace", path: Path, pairs: "list[tuple[str, st
     from ftl_lightning.apps.play.offline import PAIRS, WEIGHTS, write_offline
     from ftl_lightning.apps.play.requests import Learn
     from ftl_lightning.services.progress import bar
-    from ftl_lightning.services.text import say
 
     if workspace.work()["demonstrations"]:
         workspace.learn(Learn(workspace.suggestion), lambda progress: None, lambda: False)
@@ -189,10 +186,8 @@ def study_report(answers: list[str] = [], key: str = "", all_raters: bool = Fals
     """
     from ftl_lightning.apps.study.report import NOTES, study_table
     from ftl_lightning.evaluation.summary import show
-    from ftl_lightning.services.errors import UserError
 
-    if not answers:
-        raise UserError("answers: expected files that raters saved, found none; run: study-report study/answers*.json")
+    require(answers, "answers", "files that raters saved", "none; run: study-report study/answers*.json")
     first = Path(answers[0])
     beside = (first if first.is_dir() else first.parent) / "key.json"
     result = study_table([Path(name) for name in answers], Path(key) if key else beside, all_raters)

@@ -27,7 +27,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from ftl_lightning.services.errors import UserError, short
+from ftl_lightning.services.errors import UserError, require, short
 from ftl_lightning.services.files import check_readable
 from ftl_lightning.services.shipped import shipped
 
@@ -48,7 +48,7 @@ def find(path: str | Path) -> Path:
         UserError: if there is none, with nearby files.
     """
     file = shipped(path)
-    if not file.is_file():
+    if not file.is_file():  # the message reads folders
         raise UserError(f"{path}: expected a configuration file, found {'a folder' if file.is_dir() else 'nothing'}{_near(path)}")
     return file
 
@@ -101,15 +101,14 @@ def _merged(path: Path, section: str | None, above: tuple[Path, ...]) -> Iterato
         raise UserError(f"{above[-1]}: key '{DEFAULTS}': {path} builds on {above[-1]} itself; leave one of them out")
     keys = _read(path)
     names = keys.pop(DEFAULTS, None) or []
-    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise UserError(f"{path}: key '{DEFAULTS}': expected a list of configuration files, found {short(str(names))}")
+    valid = isinstance(names, list) and all(isinstance(name, str) for name in names)
+    require(valid, f"{path}: key '{DEFAULTS}'", "a list of configuration files", short(str(names)))
     for name in names:
         yield from _merged(_beside(path, name), section, (*above, path))
     sections = {} if section is None else {name: keys.pop(name, None) for name in SECTIONS}
     yield path, keys
     for name, content in sections.items():
-        if content is not None and not isinstance(content, dict):
-            raise UserError(f"{path}: key '{name}': expected a mapping of keys, found {short(str(content))}")
+        require(isinstance(content, dict | None), f"{path}: key '{name}'", "a mapping of keys", short(str(content)))
     if section and (content := sections[section]) is not None:
         yield path, _plain(content)
 
@@ -126,8 +125,8 @@ def _beside(path: Path, name: str) -> Path:
     except (OSError, ValueError) as error:  # a name that no file can have, or a folder that cannot be read
         reason = getattr(error, "strerror", None) or str(error)
         raise UserError(f"{path}: key '{DEFAULTS}': expected configuration files, found {short(name, 150)} ({reason})") from error
-    message = f"found no {short(name, 150)} beside it or in a folder above it"
-    raise UserError(f"{path}: key '{DEFAULTS}': expected configuration files, {message}")
+    missing = f"no {short(name, 150)} beside it or in a folder above it"
+    raise UserError(f"{path}: key '{DEFAULTS}': expected configuration files, found {missing}")
 
 
 def _relative(path: Path) -> Path:
@@ -150,8 +149,7 @@ def _read(path: Path) -> dict[str, Any]:
     ) as error:
         reason = short(str(error), 200) or "no mapping of keys"
         raise UserError(f"{path}: expected a configuration file (YAML), found {reason}") from error
-    if not isinstance(keys, dict):
-        raise UserError(f"{path}: expected a mapping of keys, found a list")
+    require(isinstance(keys, dict), str(path), "a mapping of keys", "a list")
     return _plain(copy.deepcopy(keys))
 
 

@@ -11,7 +11,7 @@ import tempfile
 from pathlib import Path
 from typing import Literal
 
-from ftl_lightning.services.errors import UserError, short
+from ftl_lightning.services.errors import UserError, require, short
 
 VARIABLE = "FTL_LIGHTNING_MOST_BYTES"
 MOST_BYTES = 2 * 2**30
@@ -34,8 +34,7 @@ def most_bytes() -> int:
         UserError: if the value is no number of bytes.
     """
     text = os.environ.get(VARIABLE, "")
-    if text and not (text.isdecimal() and len(text) < 20):
-        raise UserError(f"{VARIABLE}: expected a number of bytes, found {short(text)!r}")
+    require(not text or (text.isdecimal() and len(text) < 20), VARIABLE, "a number of bytes", repr(short(text)))
     return int(text) if text else MOST_BYTES
 
 
@@ -58,18 +57,24 @@ def check_readable(path: str | Path, kind: str, most: int | None = None) -> int:
     Raises:
         UserError: naming the file.
     """
+    place = short(str(path), 150)
     try:
         status = Path(path).stat()
     except (OSError, ValueError) as error:
-        actual = "nothing" if isinstance(error, FileNotFoundError) else getattr(error, "strerror", None) or str(error)
-        raise UserError(f"{short(str(path), 150)}: expected a {kind} file, found {actual}") from error
-    if not stat.S_ISREG(status.st_mode):
-        actual = "a folder" if stat.S_ISDIR(status.st_mode) else "a device, pipe or socket"
-        raise UserError(f"{path}: expected a {kind} file, found {actual}")
-    if status.st_size > (limit := most_bytes() if most is None else most):
-        mend = f"; if it is honest, set {VARIABLE} to more" if most is None else ""
-        raise UserError(f"{path}: expected a {kind} file of at most {limit} bytes, found {status.st_size}{mend}")
+        raise UserError(f"{place}: expected a {kind} file, found {_reason(error)}") from error
+    require(stat.S_ISREG(status.st_mode), place, f"a {kind} file", f"a {_kind(status.st_mode)}")
+    limit = most_bytes() if most is None else most
+    advice = f"; if it is honest, set {VARIABLE} to more" if most is None else ""
+    require(status.st_size <= limit, place, f"a {kind} file of at most {limit} bytes", f"{status.st_size}{advice}")
     return status.st_size
+
+
+def _reason(error: OSError | ValueError) -> str:
+    return "nothing" if isinstance(error, FileNotFoundError) else getattr(error, "strerror", None) or str(error)
+
+
+def _kind(mode: int) -> str:
+    return "folder" if stat.S_ISDIR(mode) else "file" if stat.S_ISREG(mode) else "device, pipe or socket"
 
 
 def check_unpacked(size: int, packed: int, what: str) -> None:
@@ -83,8 +88,8 @@ def check_unpacked(size: int, packed: int, what: str) -> None:
     Raises:
         UserError: naming both sizes.
     """
-    if size > (most := min(raised(max(MOST_UNPACKED, MOST_RATIO * packed)), most_bytes())):
-        raise UserError(f"{what}: expected at most {most} bytes in a file of {packed}, found {size}; save it without compression")
+    most = min(raised(max(MOST_UNPACKED, MOST_RATIO * packed)), most_bytes())
+    require(size <= most, what, f"at most {most} bytes in a file of {packed}", f"{size}; save it without compression")
 
 
 def read_text(path: str | Path, kind: str, most: int = MOST_TEXT, encoding: str = "utf-8") -> str:
@@ -112,12 +117,19 @@ def check_file(path: str | Path, key: str = "") -> None:
     Raises:
         UserError: naming the path.
     """
-    _expect(path, key, "file")
+    _check_kind(path, key, "file")
 
 
 def check_folder(path: str | Path, key: str = "") -> None:
     """Refuse an existing path that is no folder, as :func:`check_file`."""
-    _expect(path, key, "folder")
+    _check_kind(path, key, "folder")
+
+
+def check_new_folder(path: str | Path, key: str = "") -> None:
+    """As :func:`check_folder`, and refuse a folder that is not empty."""
+    check_folder(path, key)
+    empty = not Path(path).is_dir() or not any(Path(path).iterdir())
+    require(empty, _named(path, key), "an empty folder or nothing there", "one with files; choose another name")
 
 
 def check_writable_file(path: str | Path, key: str = "") -> None:
@@ -126,29 +138,30 @@ def check_writable_file(path: str | Path, key: str = "") -> None:
     The place is tested by an unnamed file in the nearest existing folder, before long work.
     """
     check_file(path, key)
-    _expect_place(Path(path).absolute().parent, Path(path), key)
-
-
-def check_new_folder(path: str | Path, key: str = "") -> None:
-    """As :func:`check_folder`, and refuse a folder that is not empty.
-
-    Raises:
-        UserError: naming the path and its key.
-    """
-    check_folder(path, key)
-    if Path(path).is_dir() and any(Path(path).iterdir()):
-        name = short(f"{key}: {path}" if key else str(path), 150)
-        raise UserError(f"{name}: expected an empty folder or nothing there, found one with files; choose another name")
+    _check_place(Path(path).absolute().parent, Path(path), key)
 
 
 def check_writable_folder(path: str | Path, key: str = "") -> None:
     """As :func:`check_folder`, and refuse an invalid name or an unwritable place."""
     check_folder(path, key)
-    _expect_place(Path(path).absolute(), Path(path), key)
+    _check_place(Path(path).absolute(), Path(path), key)
 
 
-def _expect_place(folder: Path, path: Path, key: str) -> None:
-    name = short(f"{key}: {path}" if key else str(path), 150)
+def _named(path: str | Path, key: str) -> str:
+    return short(f"{key}: {path}" if key else str(path), 150)
+
+
+def _check_kind(path: str | Path, key: str, kind: str) -> None:
+    try:
+        actual = _kind(Path(path).stat().st_mode)
+    except FileNotFoundError:
+        return  # nothing, or a link to nothing, whose target is made
+    except (OSError, ValueError) as error:
+        raise UserError(f"{_named(path, key)}: cannot be written ({_reason(error)}); choose another place") from error
+    require(actual == kind, _named(path, key), f"a {kind} or nothing there", f"a {actual}; choose another name")
+
+
+def _check_place(folder: Path, path: Path, key: str) -> None:
     there = next(parent for parent in (folder, *folder.parents) if parent.exists())
     try:
         longest = os.pathconf(there, "PC_NAME_MAX")
@@ -159,26 +172,13 @@ def _expect_place(folder: Path, path: Path, key: str) -> None:
             pass
     except (OSError, ValueError) as error:
         if isinstance(error, FileNotFoundError) and not there.exists():  # another process has just removed it
-            return _expect_place(folder, path, key)
+            return _check_place(folder, path, key)
         message = getattr(error, "strerror", None) or error
-        raise UserError(f"{name}: cannot be written ({message}); choose a writable place with room") from error
-
-
-def _expect(path: str | Path, key: str, kind: str) -> None:
-    name = short(f"{key}: {path}" if key else str(path), 150)
-    try:
-        mode = Path(path).stat().st_mode
-    except FileNotFoundError:
-        return  # nothing, or a link to nothing, whose target is made
-    except (OSError, ValueError) as error:
-        message = getattr(error, "strerror", None) or error
-        raise UserError(f"{name}: cannot be written ({message}); choose another place") from error
-    actual = "folder" if stat.S_ISDIR(mode) else "file" if stat.S_ISREG(mode) else "device, pipe or socket"
-    if actual != kind:
-        raise UserError(f"{name}: expected a {kind} or nothing there, found a {actual}; choose another name")
+        raise UserError(f"{_named(path, key)}: cannot be written ({message}); choose a writable place with room") from error
 
 
 Kind = Literal["file", "minari", "lerobot"]
+"""Kind of demonstrations: a file, a Minari data set, or a folder that is a LeRobot data set."""
 MINARI = re.compile(r"[\w./-]+-v\d+")
 """Pattern of names of Minari data sets."""
 INFO = Path("meta") / "info.json"
@@ -188,7 +188,7 @@ FILES = (".npz", ".safetensors")
 
 
 def read_from(name: str) -> tuple[Kind, str]:
-    """Resolve a name to read from.
+    """Resolve a name of demonstrations to read.
 
     Args:
         name: ``'minari:NAME'``, ``'lerobot:FOLDER'``, a folder with :data:`INFO`, the name of a Minari data set unless a file has
@@ -210,10 +210,8 @@ def read_from(name: str) -> tuple[Kind, str]:
 
 
 def written_to(name: str) -> tuple[Kind, str]:
-    """Resolve a name to write to by its prefix alone: ``'minari:NAME'``, ``'lerobot:FOLDER'``, or a file."""
+    """Resolve a name of demonstrations to write by its prefix alone: ``'minari:NAME'``, ``'lerobot:FOLDER'``, or a file."""
     kind, colon, rest = name.partition(":")
-    if colon and kind == "minari":
-        return "minari", rest
-    if colon and kind == "lerobot":
-        return "lerobot", rest
+    if colon and kind in ("minari", "lerobot"):
+        return ("minari" if kind == "minari" else "lerobot"), rest
     return "file", name

@@ -16,7 +16,7 @@ from importlib.metadata import EntryPoint, distributions
 from pathlib import Path
 
 from ftl_lightning.services.command_line import Arguments
-from ftl_lightning.services.errors import UserError, about, require, short
+from ftl_lightning.services.errors import about, require, short
 
 _TRUST = "trust"
 OPTION = f"--{_TRUST}"
@@ -165,11 +165,9 @@ def check_module(reference: str, key: str) -> None:
         UserError: with the key and the module.
     """
     module = reference.partition(":")[0]
-    if not is_installed(module) and not is_vouched(reference):
-        raise UserError(
-            f"key {short(key)!r}: expected an installed module, found {short(module)!r}, which was not imported; install its "
-            f"package, or if it is in the current folder and you trust it, add {OPTION} {short(module)}"
-        )
+    advice = f"install its package, or if it is in the current folder and you trust it, add {OPTION} {short(module)}"
+    refused = f"{short(module)!r}, which was not imported; {advice}"
+    require(is_installed(module) or is_vouched(reference), f"key {short(key)!r}", "an installed module", refused)
 
 
 def allowed(keys: object) -> set[str]:

@@ -17,7 +17,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from ftl_lightning.services.errors import UserError, about, short, shown
+from ftl_lightning.services.errors import UserError, about, require, short, shown
 from ftl_lightning.services.files import MOST_TEXT, check_readable
 from ftl_lightning.services.option_groups import groups_of, replaced
 
@@ -54,13 +54,11 @@ def check_range(key: str, value: float, least: float = -math.inf, most: float = 
     Raises:
         UserError: with key, range and value.
     """
-    if -math.inf < value < math.inf and least <= value <= most:
-        return
     if math.isinf(most):
         expected = "a finite number" if math.isinf(least) else f"{least:g} or more"
     else:
         expected = f"a number from {least:g} to {most:g}"
-    raise UserError(f"{key}: expected {expected}, found {shown(value)}")
+    require(-math.inf < value < math.inf and least <= value <= most, key, expected, value)
 
 
 def check_count(key: str, value: int, least: int, most: int = LARGEST) -> None:
@@ -79,7 +77,6 @@ FLOAT32 = 3.4e38
 """Maximum magnitude of a float."""
 DEEPEST = 40
 """Maximum nesting of lists and mappings."""
-_WORDS: Mapping[object, str] = {str: "a text", bool: "true or false", float: "a finite number (float32)"}
 _LISTS = (tuple, list, collections.abc.Sequence)
 
 T = TypeVar("T")
@@ -157,13 +154,11 @@ def from_mapping(kind: Callable[..., T], content: object, key: str, *given: obje
     hints, needed = _arguments(kind)
     names = list(hints)[len(given) :]
     if not isinstance(content, Mapping):
-        raise UserError(f"{_named(key)}: expected a mapping, found {shown(content)}")
+        raise UserError(f"{_place(key)}: expected a mapping, found {shown(content)}")
     for name in content:
-        if name not in names:
-            raise UserError(f"{_named(_joined(key, name))}: expected one of {short(', '.join(names), 120)}, found another key")
-    for name in names:
-        if name in needed and name not in content:
-            raise UserError(f"{_named(_joined(key, name))}: expected a value, found none")
+        require(name in names, _place(key, name), f"one of {short(', '.join(names), 120)}", "another key")
+    for name in needed.intersection(names):
+        require(name in content, _place(key, name), "a value", "none")
     return kind(*given, **{name: check_type(value, hints[name], _joined(key, name)) for name, value in content.items()})
 
 
@@ -194,26 +189,29 @@ def check_type(value: Any, kind: Any, key: str) -> Any:
             except UserError as error:
                 mistake = error
         raise mistake
+    valid, expected = True, ""
     if origin is Literal:
-        if not any(type(value) is type(option) and value == option for option in arguments):
-            raise _mistake(key, f"one of {', '.join(map(repr, arguments))}", value)
+        valid = any(type(value) is type(option) and value == option for option in arguments)
+        expected = f"one of {', '.join(map(repr, arguments))}"
     elif origin in (dict, collections.abc.Mapping):
-        if not isinstance(value, Mapping) or not all(isinstance(name, str) for name in value):
-            raise _mistake(key, "a mapping", value)
-        return {name: check_type(item, arguments[1], _joined(key, name)) for name, item in value.items()}
+        valid, expected = isinstance(value, Mapping) and all(isinstance(name, str) for name in value), "a mapping"
     elif origin in _LISTS:
-        if not isinstance(value, Sequence) or isinstance(value, str):
-            raise _mistake(key, "a list", value)
-        every = (check_type(item, arguments[0], f"{key}[{index}]") for index, item in enumerate(value))
-        return tuple(every) if origin is tuple else list(every)
+        valid, expected = isinstance(value, Sequence) and not isinstance(value, str), "a list"
     elif kind is int:
-        if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= LARGEST:
-            raise _mistake(key, f"a whole number from 0 to {LARGEST}", value)
+        valid = isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= LARGEST
+        expected = f"a whole number from 0 to {LARGEST}"
     elif kind is float:
-        if not isinstance(value, int | float) or isinstance(value, bool) or not abs(value) <= FLOAT32:
-            raise _mistake(key, _WORDS[kind], value)
-    elif kind in _WORDS and type(value) is not kind:
-        raise _mistake(key, _WORDS[kind], value)
+        valid = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= FLOAT32
+        expected = "a finite number (float32)"
+    elif kind in (str, bool):
+        valid, expected = type(value) is kind, "a text" if kind is str else "true or false"
+    if not valid:
+        raise UserError(f"{_place(key)}: expected {expected}, found {shown(value)}")
+    if origin in (dict, collections.abc.Mapping):
+        return {name: check_type(item, arguments[1], _joined(key, name)) for name, item in value.items()}
+    if origin in _LISTS:
+        items = (check_type(item, arguments[0], f"{key}[{index}]") for index, item in enumerate(value))
+        return tuple(items) if origin is tuple else list(items)
     return value
 
 
@@ -221,12 +219,10 @@ def _joined(key: str, name: object) -> str:
     return f"{key}.{short(str(name))}" if key else short(str(name))
 
 
-def _named(key: str) -> str:
+def _place(key: str, name: object = None) -> str:
+    """Location of a key, or of a name in it, for messages."""
+    key = key if name is None else _joined(key, name)
     return f"key {key!r}" if key else "content"
-
-
-def _mistake(key: str, expected: str, value: object) -> UserError:
-    return UserError(f"{_named(key)}: expected {expected}, found {shown(value)}")
 
 
 ELSEWHERE = {
@@ -277,8 +273,7 @@ def check_text(key: str, value: object, example: str) -> None:
     Raises:
         UserError: with an example.
     """
-    if not isinstance(value, str):
-        raise UserError(f"{key}: expected a text, such as {shown(example, 40)}, found {shown(value)}")
+    require(isinstance(value, str), key, f"a text, such as {shown(example, 40)}", shown(value))
 
 
 def check_path(key: str, value: object, what: str) -> None:
@@ -287,8 +282,7 @@ def check_path(key: str, value: object, what: str) -> None:
     Raises:
         UserError: with the expected kind of path.
     """
-    if not isinstance(value, str | os.PathLike):
-        raise UserError(f"{key}: expected {what}, found {shown(value)}")
+    require(isinstance(value, str | os.PathLike), key, what, shown(value))
 
 
 def changed(
@@ -363,21 +357,17 @@ def device_named(name: object) -> "torch.device":
     """
     import torch
 
-    message = f"device: expected one that this machine has, {' or '.join(_devices())}, found {shown(name)}"
-    if not isinstance(name, str | torch.device):
-        raise UserError(message)
+    expected = f"one that this machine has, {' or '.join(_devices())}"
+    require(isinstance(name, str | torch.device), "device", expected, shown(name))
     try:
-        device = torch.device(name)
-    except RuntimeError as error:
-        raise UserError(message) from error
-    try:
+        device = torch.device(name)  # type: ignore[arg-type]
         torch.ones(1, device=device).cpu()  # a valid name may be unavailable
-    except (RuntimeError, AssertionError, NotImplementedError) as error:  # kinds of unavailability
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
         # An available device may be out of memory or broken.
-        if str(device) in _devices() or (device.type == "cuda" and device.index is None and torch.cuda.is_available()):
+        if str(name) in _devices() or (str(name) == "cuda" and torch.cuda.is_available()):
             reason = short(next(iter(str(error).splitlines()), "") or type(error).__name__)
-            raise UserError(f"device: expected {device} to compute, found that it cannot: {reason}") from error
-        raise UserError(message) from error
+            raise UserError(f"device: expected {name} to compute, found that it cannot: {reason}") from error
+        raise UserError(f"device: expected {expected}, found {shown(name)}") from error
     return device
 
 
