@@ -14,7 +14,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent))  # the package of this che
 import yaml
 
 from docs.sources import SourceError, values
-from ftl_lightning.services.printing import say
+from ftl_lightning.services.text import say
 
 ROOT = Path(__file__).parent.parent
 FOLDER = ROOT / "docs" / "claims"

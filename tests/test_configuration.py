@@ -12,7 +12,8 @@ import pytest
 import yaml
 
 from ftl_lightning.few_shot.tuned import settings_of
-from ftl_lightning.services.configuration import SECTIONS, _read, expanded, find, load, parts
+from ftl_lightning.services.command_line import Arguments
+from ftl_lightning.services.configuration import SECTIONS, _read, find, load, parts
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.shipped import shipped
 from tests.conftest import CONF, ROOT
@@ -81,11 +82,21 @@ def test_mistakes_in_a_file_name_it_in_one_short_line(text: str, expected: str) 
 def test_a_command_line_gets_the_content_of_its_files() -> None:
     write("a.yaml", "x: 1.0e-3\n")
     for given in (["--config", "a.yaml"], ["--config=a.yaml"], ["-c", "a.yaml"]):
-        *_, value = expanded(["fit", *given])[-1].split("=")
-        assert yaml.safe_load(value) == {"x": 1e-3}
-    inline = ["--config", "{x: 2}", "--y=3", "--config"]
-    assert expanded(inline) == inline
-    assert expanded(expanded(["--config", "a.yaml"])) == expanded(["--config", "a.yaml"])
+        (text,) = Arguments.read(given).expanded()
+        assert yaml.safe_load(text.removeprefix("--config=")) == {"x": 1e-3}
+        assert Arguments.read([text]).expanded() == [text]
+    assert Arguments.read(["--config", "{x: 2}", "--config"]).expanded() == ["--config={x: 2}", "--config"]
+
+
+def test_arguments_are_positional_ones_and_options() -> None:
+    given = ["a", "-h", "b", "--x", "-1", "--y=", "--print_config", "c", "--z", "--u+", "v", "w"]
+    arguments = Arguments.read(given)
+    assert arguments.positional == ("a", "b", "c", "w")
+    assert arguments.options == (("help", None), ("x", "-1"), ("y", ""), ("print_config", None), ("z", None), ("u+", "v"))
+    assert arguments.words() == ["a", "b", "c", "w", "--help", "--x=-1", "--y=", "--print_config", "--z", "--u+=v"]
+    assert Arguments.read(arguments.words()) == arguments
+    assert arguments.without("x").values("x") == []
+    assert arguments.values("z") == [""]
 
 
 def test_the_shipped_files_are_those_of_the_repository_and_what_is_there_wins(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -113,7 +124,7 @@ def test_sections_count_for_their_verb_alone_and_after_the_other_keys_of_their_f
         ("a.yaml", {"x": 1, "y": 1}),
         ("a.yaml", {"x": 3, "z": {"u": 1}}),
     ]
-    assert yaml.safe_load(expanded(["--config=b.yaml"], "fit")[0].removeprefix("--config=")) == {"x": 4, "y": 5}
+    assert yaml.safe_load(Arguments.read(["--config=b.yaml"]).expanded("fit")[0].removeprefix("--config=")) == {"x": 4, "y": 5}
     write("a.yaml", "x: 1\nfit: {x: 2}\n")
     assert load("a.yaml", "ablate") == load("a.yaml") == {"x": 1, "fit": {"x": 2}}  # files of other verbs have no sections
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from ftl_lightning.services.data_names import read_from, written_to
+from ftl_lightning.services.files import read_from, written_to
 
 
 def test_a_name_is_a_file_unless_it_says_or_is_something_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

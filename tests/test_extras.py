@@ -17,7 +17,7 @@ from ftl_lightning.domains.driving.traffic import SHIPPED
 from ftl_lightning.domains.mocap.measures import learned_elsewhere
 from ftl_lightning.reporting.concept_figures import concept_map
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.extras import EXTRAS, check_extra
+from ftl_lightning.services.shipped import EXTRAS, check_extra
 from tests.conftest import CONF, ROOT, environment, refused
 from tests.domains.test_from_file import walks
 from tests.tiny import QUIET

@@ -24,7 +24,7 @@ from ftl_lightning.igm.settings import InversionSettings
 from ftl_lightning.methods.ftl_igm.model import DiffusionConfig, GenerativeModel
 from ftl_lightning.services.configuration import load
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.seeding import generator
+from ftl_lightning.services.randomness import generator
 from ftl_lightning.services.tensor_file import file_hash
 from ftl_lightning.training.model_config import Prepared
 from tests.conftest import CONF, ROOT

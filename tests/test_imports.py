@@ -103,19 +103,8 @@ def test_help_of_these_verbs_does_not_even_import_torch(tmp_path: Path) -> None:
     assert imported(more + run(verbs), tmp_path) == {" ".join(verb): [] for verb in verbs}
 
 
-def test_what_is_imported_is_not_searched_for_garbage_and_what_is_forbidden_is_found(tmp_path: Path) -> None:
+def test_forbidden_packages_are_found(tmp_path: Path) -> None:
     for name in ("scipy", "sympy"):
         (tmp_path / f"{name}.py").touch()
-    program = """
-import gc
-from ftl_lightning.services.starting import imported
-before = gc.get_freeze_count()
-assert imported("colorsys") is imported("colorsys") and gc.isenabled() and gc.get_freeze_count() > before
-gc.disable()
-imported("sched")
-assert not gc.isenabled(), "it was off before"
-found("neither")
-import scipy, sympy
-found("both")
-"""
+    program = "found('neither')\nimport scipy, sympy\nfound('both')\n"
     assert imported(program, tmp_path) == {"neither": [], "both": ["sympy", "scipy"]}

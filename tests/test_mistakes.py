@@ -391,7 +391,7 @@ def test_the_version_of_a_checkpoint(capsys: Told) -> None:
         (["generate", "agent", "--seed=foo"], "seed"),
         (["concepts", "agnet"], "did you mean agent"),
         (["encode", "agent", "--encoder=/nowhere"], "encoder: expected"),
-        (["encode", "agent", "--encoder=hashing", "--out=x.npz"], f"{TABLE}, which is what is written, found 'x.npz'"),
+        (["encode", "agent", "--encoder=hashing", "--out=x.npz"], f"{TABLE}, which is what is written, found x.npz"),
         (["prepare", "agent"], "domain: expected one whose recordings"),
         (["report", "--results=nothing"], "expected"),
         (["study-report"], "answers: expected files"),

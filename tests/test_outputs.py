@@ -32,8 +32,7 @@ from ftl_lightning.reporting.figures import accuracy_bars
 from ftl_lightning.reporting.measurements import read_frontier, read_speed
 from ftl_lightning.reporting.report import write_report
 from ftl_lightning.reporting.table import domain_of
-from ftl_lightning.services.escape import figure_text, latex, latex_row, markdown
-from ftl_lightning.services.printing import line, plain, say
+from ftl_lightning.services.text import figure_text, latex, latex_row, line, markdown, plain, say
 from tests import conftest
 from tests.conftest import ROOT, Once, python, succeed
 from tests.study import simulated, write_films

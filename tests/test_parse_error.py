@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from ftl_lightning.apps.lightning_cli import parse
+from ftl_lightning.services.command_line import Arguments, one_line
 from ftl_lightning.services.errors import LONGEST, UserError
-from ftl_lightning.services.parse_error import one_line
 from tests.conftest import refused
 
 MISTAKES = [
@@ -33,7 +33,7 @@ def line_of(verb: str, *arguments: str) -> str:
     """The one short line that the program prints of what the parser of a verb refuses."""
     with pytest.raises((ArgumentError, UserError)) as error:
         parse(verb, list(arguments))
-    told = one_line(str(error.value), [verb, *arguments])
+    told = one_line(str(error.value), verb, Arguments.read(arguments))
     assert "\n" not in told
     assert len(f"error: {told}") <= LONGEST
     return told

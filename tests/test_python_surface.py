@@ -22,7 +22,7 @@ from ftl_lightning.igm.concept import Concept
 from ftl_lightning.igm.explanation import explain
 from ftl_lightning.igm.forms.modes import Modes
 from ftl_lightning.services.errors import LONGEST, UserError
-from ftl_lightning.services.seeding import generator
+from ftl_lightning.services.randomness import generator
 from ftl_lightning.services.shipped import list_models
 from ftl_lightning.training.checks import longer_than_plans
 from tests.conftest import python

@@ -15,7 +15,11 @@ from tests.conftest import ROOT
 PAGE = (ROOT / "docs" / "reference.md").read_text("utf-8")
 MODULES = re.findall(r"^\.\. automodule:: (\S+)$", PAGE, re.M)
 ENTRANCE = [
-    "ftl_lightning.cli.commands",
+    "ftl_lightning.cli.concepts",
+    "ftl_lightning.cli.demonstrations",
+    "ftl_lightning.cli.experiments",
+    "ftl_lightning.cli.pages",
+    "ftl_lightning.cli.sample",
     "ftl_lightning.igm.composition",
     "ftl_lightning.igm.concept",
     "ftl_lightning.igm.forms.modes",

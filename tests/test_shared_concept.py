@@ -23,7 +23,7 @@ from ftl_lightning.igm.concept import Concept
 from ftl_lightning.igm.library import concepts_folder
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.services.errors import LONGEST, UserError
-from ftl_lightning.services.printing import line
+from ftl_lightning.services.text import line
 from tests.conftest import ROOT
 from tests.test_outputs import NAMES
 

@@ -17,7 +17,7 @@ from ftl_lightning import FewShot
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.model import Draws
-from ftl_lightning.services.seeding import generator
+from ftl_lightning.services.randomness import generator
 from ftl_lightning.services.tensor_file import write_text
 from ftl_lightning.training.concept_model import ConceptModel
 

@@ -27,7 +27,7 @@ from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.services.progress import bar
-from ftl_lightning.services.seeding import generator
+from ftl_lightning.services.randomness import generator
 from ftl_lightning.services.tensor_file import write_text
 from ftl_lightning.training.checks import check_concept
 from ftl_lightning.training.concept_model import ConceptModel

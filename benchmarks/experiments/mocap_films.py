@@ -15,7 +15,7 @@ import torch
 from mocap_distances import GUIDANCE, recorded
 from torch import Tensor
 
-from ftl_lightning.cli.commands import StudyOptions, study
+from ftl_lightning.cli.pages import StudyOptions, study
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.mocap.domain import DOMAIN
 from ftl_lightning.domains.mocap.skeleton import COLUMNS
@@ -24,8 +24,8 @@ from ftl_lightning.domains.mocap.tasks import TEST_CONCEPTS
 from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.networks.text_encoder import TableEncoder
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.ranges import check_count
-from ftl_lightning.services.seeding import DEMONSTRATION_SEED, EVALUATION_SEED
+from ftl_lightning.services.randomness import DEMONSTRATION_SEED, EVALUATION_SEED
+from ftl_lightning.services.validation import check_count
 from ftl_lightning.training.concept_model import TextConceptModel
 
 PROJECT = Path(__file__).resolve().parents[2]

@@ -23,7 +23,7 @@ from ftl_lightning.domains.tabletop.source import Episode, joined_episodes, perf
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.services.progress import bar
-from ftl_lightning.services.seeding import generator, task_key
+from ftl_lightning.services.randomness import generator, task_key
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.model_folder import load_model
 

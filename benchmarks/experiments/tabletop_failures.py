@@ -42,7 +42,7 @@ from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.seeding import generator
+from ftl_lightning.services.randomness import generator
 from ftl_lightning.services.tensor_file import write_text
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.model_folder import load_model

@@ -24,7 +24,7 @@ from ftl_lightning.domains.tabletop.rendering import film
 from ftl_lightning.evaluation.closed_loop import roll_out
 from ftl_lightning.evaluation.pictures import captioned, gif, outcome_text
 from ftl_lightning.few_shot.learner import FewShot
-from ftl_lightning.services.seeding import DEMONSTRATION_SEED, EVALUATION_SEED
+from ftl_lightning.services.randomness import DEMONSTRATION_SEED, EVALUATION_SEED
 from ftl_lightning.services.tensor_file import atomic
 
 DEMONSTRATIONS = 10

@@ -66,14 +66,12 @@ def stopping(kind, name):
 arguments = {arguments!r}
 from ftl_lightning.cli import main as cli
 if arguments[0] == "fit":
-    from ftl_lightning.services.starting import imported
-    imported("ftl_lightning.apps.lightning_cli")
+    import ftl_lightning.apps.lightning_cli
     from ftl_lightning.training.pretraining import Pretraining
     stopping(Pretraining, "training_step")
 elif arguments[0] == "invert":
     if arguments[1].startswith("-"):
-        from ftl_lightning.services.starting import imported
-        imported("ftl_lightning.apps.lightning_cli")
+        import ftl_lightning.apps.lightning_cli
     from ftl_lightning.igm.inversion import Inversion
     stopping(Inversion, "step_losses")
 assert cli.main(arguments) == 0

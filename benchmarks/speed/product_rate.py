@@ -24,7 +24,7 @@ from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.inversion import invert
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
-from ftl_lightning.services.seeding import generator
+from ftl_lightning.services.randomness import generator
 from ftl_lightning.services.tensor_file import write_text
 from ftl_lightning.training.data import InversionData
 from ftl_lightning.training.model_folder import read_model

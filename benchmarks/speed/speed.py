@@ -38,7 +38,7 @@ from ftl_lightning.igm.settings import InversionSettings
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.reporting.measurements import ONE, PUBLISHED, TEN, Measured, reached
 from ftl_lightning.services.progress import bar
-from ftl_lightning.services.seeding import generator, task_key
+from ftl_lightning.services.randomness import generator, task_key
 from ftl_lightning.services.tensor_file import write_text
 from ftl_lightning.training.data import InversionData
 from ftl_lightning.training.model_folder import read_model

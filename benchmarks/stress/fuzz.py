@@ -41,7 +41,7 @@ from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.services.configuration import load
 from ftl_lightning.services.errors import LONGEST, UserError
-from ftl_lightning.services.seeding import generator
+from ftl_lightning.services.randomness import generator
 from ftl_lightning.services.shipped import pretrained_folder
 from ftl_lightning.training.checkpoint import read_checkpoint
 from ftl_lightning.training.checks import check_concept

@@ -15,7 +15,7 @@ from ftl_lightning.domains.domain import Concepts, Domain, Metric, Plans, Split
 from ftl_lightning.domains.execution import ClosedLoop, Rollout
 from ftl_lightning.domains.films import Frames
 from ftl_lightning.domains.tasks import few_shot_suites
-from ftl_lightning.services.seeding import VALIDATION_SEED, generator, task_key
+from ftl_lightning.services.randomness import VALIDATION_SEED, generator, task_key
 
 PLANS = Plans(horizon=16, columns=("x", "y"), units=("m", "m"))
 WORLD = Feature(shape=(6,), state=(0, 1))  # x and y of the point, the red target and the blue target

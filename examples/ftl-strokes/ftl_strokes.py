@@ -8,7 +8,7 @@ from torch import Tensor
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.domain import Concepts, Domain, Generated, Metric, Plans
 from ftl_lightning.domains.tasks import few_shot_suites
-from ftl_lightning.services.seeding import generator, task_key
+from ftl_lightning.services.randomness import generator, task_key
 
 PLANS = Plans(horizon=32, columns=("x", "y"), units=("cm", "cm"))
 S = torch.linspace(0, 1, PLANS.horizon)  # the way along a stroke; points are complex numbers x + iy

@@ -6,7 +6,7 @@ import warnings
 from argparse import ArgumentError
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import is_dataclass
+from dataclasses import is_dataclass, replace
 from pathlib import Path
 from types import NoneType
 from typing import Any, get_args, get_type_hints
@@ -21,15 +21,14 @@ from omegaconf import OmegaConf
 
 from ftl_lightning.evaluation.evaluator import Evaluator
 from ftl_lightning.services import log_folder, trust
-from ftl_lightning.services.configuration import configurations, expanded, parts
+from ftl_lightning.services.command_line import Arguments
+from ftl_lightning.services.configuration import parts
 from ftl_lightning.services.errors import UserError, mistake_behind, short
-from ftl_lightning.services.inputs import options
-from ftl_lightning.services.printing import say
-from ftl_lightning.services.ranges import check_range
-from ftl_lightning.training import process_group
+from ftl_lightning.services.text import say
+from ftl_lightning.services.validation import check_range
+from ftl_lightning.training.board import TrainingBar, accuracies
 from ftl_lightning.training.checkpoint import last_checkpoint, read_checkpoint
-from ftl_lightning.training.trainer import Trainer
-from ftl_lightning.training.training_bar import TrainingBar, accuracies
+from ftl_lightning.training.trainer import Trainer, one_voice
 
 
 class CommandLine(LightningCLI):
@@ -55,7 +54,9 @@ class CommandLine(LightningCLI):
         verb = self.config.get("subcommand")
         self._expect_keys(self.config[verb] if verb else self.config, args)
         for key in ("model", "data"):
-            _expect_values(key, (self.config[verb] if verb else self.config).get(key), [option for option, _ in options(args)])
+            _expect_values(
+                key, (self.config[verb] if verb else self.config).get(key), [option for option, _ in Arguments.read(args).options]
+            )
         seed = (self.config[verb] if verb else self.config).get("seed_everything")
         if isinstance(seed, int) and not isinstance(seed, bool):
             check_range("seed_everything", seed, 0, 2**32 - 1)
@@ -67,8 +68,8 @@ class CommandLine(LightningCLI):
         Raises:
             ArgumentError: with the key.
         """
-        for option, text in options(arguments):
-            keys = OmegaConf.to_container(OmegaConf.create(text)) if option == "config" and ":" in text else {}
+        for text in Arguments.read(arguments).values("config"):
+            keys = OmegaConf.to_container(OmegaConf.create(text)) if ":" in text else {}
             for key in keys if isinstance(keys, dict) else ():
                 if key not in known.as_dict():
                     raise ArgumentError(None, f"Group 'configuration' does not accept option '{short(str(key))}'")
@@ -202,20 +203,14 @@ GROUPS = ("adapter", "budget", "codes", "embeddings", "loss", "modes", "weights"
 """Option groups of shipped modules."""
 
 
-def _null_in_groups(arguments: Sequence[str]) -> list[str]:
+def _null_in_groups(arguments: Arguments) -> Arguments:
     """Rewrite ``--model.GROUP.OPTION null`` as ``--model.GROUP={"OPTION": null}``; the parser reads the former as a text."""
-    result, rest = [], list(arguments)
-    while rest:
-        argument = rest.pop(0)
-        option, equals, value = argument.partition("=")
-        group, dot, name = option.removeprefix("--model.").removeprefix("init_args.").partition(".")
-        if not (option.startswith("--model.") and dot and group in GROUPS):
-            result.append(argument)
-            continue
-        if not equals and rest and not rest[0].startswith("--"):
-            equals, value = "=", rest.pop(0)
-        result.append(f'--model.{group}={{"{name}": null}}' if value == "null" else f"{option}{equals}{value}")
-    return result
+    options = []
+    for option, value in arguments.options:
+        group, dot, name = option.removeprefix("model.").removeprefix("init_args.").partition(".")
+        null = option.startswith("model.") and dot and group in GROUPS and value == "null"
+        options.append((f"model.{group}", f'{{"{name}": null}}') if null else (option, value))
+    return replace(arguments, options=tuple(options))
 
 
 def _behind(error: BaseException) -> str:
@@ -247,22 +242,22 @@ class _Parser(CommandLine):
         """Nothing."""
 
 
-def run(arguments: list[str]) -> None:
+def run(verb: str, arguments: Arguments) -> None:
     """Parse and run one of Lightning's verbs or ``invert``."""
-    with process_group.one_voice(), log_folder.run():
-        _command_line(CommandLine, arguments[0], arguments, run=True)
+    with one_voice(), log_folder.run():
+        _command_line(CommandLine, verb, arguments, run=True)
 
 
 def build(verb: str, options: list[str]) -> CommandLine:
     """Parse the options of ``fit`` or ``invert`` and build trainer, model and data without running anything."""
-    line = _command_line(_Inversion if verb == "invert" else _Fit, verb, options, run=False)
-    process_group.check_alone(line.trainer, "what another program runs")  # other processes would repeat its command line
+    line = _command_line(_Inversion if verb == "invert" else _Fit, verb, Arguments.read(options), run=False)
+    line.trainer.check_alone("what another program runs")  # other processes would repeat its command line
     return line
 
 
 def parse(verb: str, options: list[str]) -> dict[str, Any]:
     """Parse the options of a verb to values by key; nothing is built."""
-    config: dict[str, Any] = _command_line(_Parser, verb, options, run=False).config.as_dict()
+    config: dict[str, Any] = _command_line(_Parser, verb, Arguments.read(options), run=False).config.as_dict()
     return config
 
 
@@ -270,22 +265,22 @@ PACKAGES = ("ftl_lightning", "lightning", "lightning_fabric", "pytorch_lightning
 """Packages with classes that configurations may name."""
 
 
-def _expect_trusted(verb: str, arguments: list[str]) -> None:
+def _expect_trusted(verb: str, arguments: Arguments) -> None:
     """Allow a configuration only classes of packages that are installed or trusted by the user.
 
     Raises:
         UserError: with file, key and module of another class.
     """
     packages = set(PACKAGES)
-    sources = [(str(path), keys) for given in configurations(arguments) for path, keys in parts(given, verb)]
-    for where, keys in (*sources, ("options", dict(options(arguments)))):
+    sources = [(str(path), keys) for given in arguments.configurations() for path, keys in parts(given, verb)]
+    for where, keys in (*sources, ("options", dict(arguments.options))):
         trust.check_classes(keys, where)
         packages |= trust.allowed(keys)
     trust.allow_classes(packages)
     set_parsing_settings(omegaconf_absolute_to_relative_paths=True)
 
 
-def _command_line(kind: type[CommandLine], verb: str, arguments: list[str], run: bool) -> CommandLine:
+def _command_line(kind: type[CommandLine], verb: str, arguments: Arguments, run: bool) -> CommandLine:
     _expect_trusted(verb, arguments)
     warnings.filterwarnings("ignore", message=".*does not have many workers.*")  # data are in memory
     warnings.filterwarnings("ignore", message=".*`IterableDataset` has `__len__` defined.*")  # there are no workers
@@ -298,6 +293,7 @@ def _command_line(kind: type[CommandLine], verb: str, arguments: list[str], run:
     warnings.filterwarnings("ignore", message=".*`isinstance.treespec, LeafSpec.` is deprecated.*")  # within Lightning
     for name in ("lightning.pytorch", "lightning.fabric"):  # advice and advertisements; warnings and errors stay
         logging.getLogger(name).setLevel(logging.WARNING)
+    logging.getLogger("lightning.fabric.strategies.launchers").setLevel(logging.INFO)  # reports a process that ended early
     try:
         return kind(
             pl.LightningModule,
@@ -308,7 +304,7 @@ def _command_line(kind: type[CommandLine], verb: str, arguments: list[str], run:
             save_config_kwargs={"overwrite": True},
             parser_kwargs={"parser_mode": "omegaconf+", "exit_on_error": False},
             run=run,
-            args=expanded(_null_in_groups(arguments), verb),
+            args=[*([verb] if run else ()), *_null_in_groups(arguments).expanded(verb)],
         )
     except OSError as error:
         raise UserError(

@@ -1,22 +1,68 @@
-"""Command line, with lazy imports for a fast start of verbs without a trainer."""
+"""Command line: a table of verbs. Verbs import what they need when they run, for a fast start."""
 
-import importlib
 import json
 import os
 import sys
 from argparse import ArgumentError
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 from omegaconf.errors import OmegaConfBaseException
 
-from ftl_lightning.services import inputs, trust
-from ftl_lightning.services.configuration import expanded
-from ftl_lightning.services.errors import UserError, mistake_of_machine
-from ftl_lightning.services.parse_error import one_line
-from ftl_lightning.services.printing import any_terminal, line, say
-from ftl_lightning.services.starting import imported
+from ftl_lightning.cli import concepts, demonstrations, experiments, pages, sample
+from ftl_lightning.services import trust
+from ftl_lightning.services.command_line import TRAINER, Arguments, check_inputs, command_checks, one_line
+from ftl_lightning.services.errors import UserError, mistake_of_machine, require
+from ftl_lightning.services.text import any_terminal, line, say
 from ftl_lightning.version import __version__
+
+
+@dataclass(frozen=True)
+class Command:
+    """Verb without a trainer.
+
+    Attributes:
+        summary: line of the overview.
+        function: what runs; called with the options class, or without it with the function's own arguments.
+        options: options class.
+        positional: whether required arguments are positional.
+        first: option that may also be the first positional argument.
+        several: option that collects positional arguments.
+        repeated: option that may be repeated.
+    """
+
+    summary: str
+    function: Callable[..., None]
+    options: type | None = None
+    positional: bool = False
+    first: str = ""
+    several: str = ""
+    repeated: str = ""
+
+    def run(self, verb: str, arguments: Arguments) -> None:
+        """Parse the arguments and run."""
+        check_inputs(verb, arguments, command_checks(verb))
+        from jsonargparse import auto_cli
+
+        trust.allow_classes(("ftl_lightning",))  # stages of an ablation; these verbs accept no other class
+        if self.several and arguments.positional:
+            gathered = (self.several, json.dumps(arguments.positional))
+            arguments = replace(arguments, positional=(), options=(gathered, *arguments.options))
+        if values := arguments.values(self.repeated):
+            require(all(values), self.repeated, "a value", "none")
+            rest = arguments.without(self.repeated)
+            arguments = replace(rest, options=(*rest.options, (self.repeated, json.dumps(values))))
+        parsed: Any = auto_cli(
+            self.options or self.function,
+            args=arguments.expanded(verb),
+            exit_on_error=False,
+            as_positional=self.positional,
+            prog=f"python -m ftl_lightning {verb}",
+        )
+        if self.options:
+            self.function(parsed)
+
 
 TRAINER_VERBS = {
     "fit": "pretrain a model on a domain's training concepts",
@@ -24,40 +70,49 @@ TRAINER_VERBS = {
     "validate": "validation loss and accuracy of a checkpoint",
     "test": "evaluate a checkpoint and write the results file",
 }
-COMMANDS = {
-    "play": "show behaviour five times on a page, see it learned, and mix it with other concepts",
-    "generate": "draw demonstrations of a task into a file",
-    "check": "say whether demonstrations of a concept suffice, and which of them is odd",
-    "sample": "generate behaviour from a learned concept, composed with training concepts",
-    "view": "watch demonstrations, samples, a concept or results on a page",
-    "concepts": "list the concepts of a model: training concepts and learned ones",
-    "explain": "say in words what a learned concept is made of",
-    "ablate": "run every cell of an ablation, those that are missing in the results",
-    "benchmark": "run a method through frozen suites, check a submission, make the leaderboard",
-    "report": "tables and figures from results, beside the paper's numbers",
-    "prepare": "read your own copy of a domain's recordings, which do not ship",
-    "study": "make a web page in which people rate films of generated behaviour",
-    "study-report": "the table of what they answered",
-    "encode": "make a domain's table of concept embeddings with a language model",
+COMMANDS: Mapping[str, Command] = {
+    "play": Command(
+        "show behaviour five times on a page, see it learned, and mix it with other concepts",
+        pages.play,
+        pages.PlayOptions,
+        first="pretrained",
+    ),
+    "generate": Command("draw demonstrations of a task into a file", demonstrations.generate, positional=True),
+    "check": Command(
+        "say whether demonstrations of a concept suffice, and which of them is odd",
+        demonstrations.check,
+        demonstrations.CheckOptions,
+        positional=True,
+    ),
+    "sample": Command(
+        "generate behaviour from a learned concept, composed with training concepts", sample.sample, sample.SampleOptions
+    ),
+    "view": Command(
+        "watch demonstrations, samples, a concept or results on a page", pages.view, pages.ViewOptions, positional=True
+    ),
+    "concepts": Command(
+        "list the concepts of a model: training concepts and learned ones", concepts.concepts, positional=True, repeated="folder"
+    ),
+    "explain": Command("say in words what a learned concept is made of", concepts.explain),
+    "ablate": Command(
+        "run every cell of an ablation, those that are missing in the results", experiments.ablate, experiments.AblateOptions
+    ),
+    "benchmark": Command(
+        "run a method through frozen suites, check a submission, make the leaderboard",
+        experiments.benchmark,
+        experiments.BenchmarkOptions,
+        first="method",
+    ),
+    "report": Command("tables and figures from results, beside the paper's numbers", experiments.report),
+    "prepare": Command("read your own copy of a domain's recordings, which do not ship", demonstrations.prepare, positional=True),
+    "study": Command(
+        "make a web page in which people rate films of generated behaviour", pages.study, pages.StudyOptions, positional=True
+    ),
+    "study-report": Command("the table of what they answered", pages.study_report, several="answers"),
+    "encode": Command("make a domain's table of concept embeddings with a language model", demonstrations.encode, positional=True),
 }
-POSITIONAL = {"check", "concepts", "generate", "encode", "invert", "prepare", "study", "view"}
-"""Commands with positional required arguments."""
-FIRST = {"play": "pretrained", "benchmark": "method"}
-"""Option of a command that may also be its first positional argument."""
-SEVERAL = {"study-report": "answers"}
-"""Option of a command that collects positional files."""
-REPEATED = {"concepts": "folder"}
-"""Option of a command that may be repeated."""
-MODULES = {
-    "ablate": "ftl_lightning.cli.ablate_command",
-    "benchmark": "ftl_lightning.cli.benchmark_command",
-    "check": "ftl_lightning.cli.check_command",
-    "invert": "ftl_lightning.cli.invert_command",
-    "play": "ftl_lightning.cli.play_command",
-    "sample": "ftl_lightning.cli.sampling_command",
-    "view": "ftl_lightning.cli.play_command",
-}
-"""Modules of commands that are not in ``commands``."""
+_INVERT = Command(TRAINER_VERBS["invert"], concepts.invert, concepts.InvertOptions, positional=True)
+"""``invert`` with positional arguments (model and file), which needs no trainer."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -69,29 +124,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
         Exit code: 0; 2 for a user's mistake, or 130 for an interruption, each with a line on standard error.
     """
-    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    verb, *words = (sys.argv[1:] if arguments is None else arguments) or ["--help"]
+    read = Arguments.read(words)
     any_terminal()
     # Never unpickle, whatever a library's default is.
     os.environ["TORCH_FORCE_WEIGHTS_ONLY_LOAD"] = "1"
     try:
-        with trust.person(arguments) as rest:
-            _dispatch(rest)
+        with trust.person(verb, read) as rest:
+            _dispatch(verb, rest)
     except UserError as error:
-        say("error:", line(str(error)), error=True)
-        return 2
+        return _refused(str(error))
     except OmegaConfBaseException as error:
-        say("error: configuration:", line(str(error).splitlines()[0]), error=True)
-        return 2
+        return _refused(f"configuration: {str(error).splitlines()[0]}")
     except ArgumentError as error:
-        say("error:", line(one_line(str(error), arguments)), error=True)
-        return 2
+        return _refused(one_line(str(error), verb, read))
     except KeyboardInterrupt:
         return _interrupted()
     except (OSError, MemoryError, RuntimeError, ValueError) as error:
         if (message := mistake_of_machine(error)) is None:
             raise
-        say("error:", line(message), error=True)
-        return 2
+        return _refused(message)
     except SystemExit as stop:  # after --help and --print_config
         if isinstance(stop.__context__, KeyboardInterrupt):  # Lightning's way
             return _interrupted()
@@ -99,67 +151,40 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
+def _refused(message: str) -> int:
+    say("error:", line(message), error=True)
+    return 2
+
+
 def _interrupted() -> int:
     say("interrupted: what was written before is whole", error=True)
     return 130
 
 
-def _dispatch(arguments: list[str]) -> None:
-    verb = arguments[0] if arguments else "--help"
-    if verb in FIRST and len(arguments) > 1 and not arguments[1].startswith("-"):
-        arguments = [verb, f"--{FIRST[verb]}={arguments[1]}", *arguments[2:]]
+def _dispatch(verb: str, arguments: Arguments) -> None:
     if verb in ("-h", "--help"):
         say(_overview())
     elif verb == "--version":
         say(__version__)
-    elif verb in COMMANDS or (verb == "invert" and _by_position(arguments[1:])):
-        inputs.check_inputs(verb, arguments[1:], inputs.command_checks(verb))
-        from jsonargparse import auto_cli
-
-        trust.allow_classes(("ftl_lightning",))  # stages of an ablation; these verbs accept no other class
-        commands = importlib.import_module(MODULES.get(verb, "ftl_lightning.cli.commands"))
-        name = verb.replace("-", "_")
-        function, kind = getattr(commands, name), getattr(commands, f"{name.capitalize()}Options", None)
-        options: dict[str, Any] = {"as_positional": verb in POSITIONAL, "prog": f"python -m ftl_lightning {verb}"}
-        given = _gathered(arguments[1:], SEVERAL[verb]) if verb in SEVERAL else arguments[1:]
-        given = _repeated(given, REPEATED[verb]) if verb in REPEATED else given
-        parsed = auto_cli(kind or function, args=expanded(given, verb), exit_on_error=False, **options)
-        if kind:  # an options class
-            function(parsed)
+    elif verb in COMMANDS:
+        command, positional = COMMANDS[verb], arguments.positional
+        if command.first and positional:
+            options = ((command.first, positional[0]), *arguments.options)
+            arguments = Arguments(positional[1:], options)
+        command.run(verb, arguments)
+    elif verb == "invert" and arguments.positional:
+        _INVERT.run(verb, arguments)
     elif verb in TRAINER_VERBS:
-        inputs.check_inputs(verb, arguments[1:], inputs.TRAINER)
-        imported("ftl_lightning.apps.lightning_cli").run(arguments)
+        check_inputs(verb, arguments, TRAINER)
+        from ftl_lightning.apps.lightning_cli import run
+
+        run(verb, arguments)
     else:
         raise UserError(f"verb: expected one of {', '.join((*TRAINER_VERBS, *COMMANDS))}, found {verb!r}")
 
 
-def _by_position(arguments: Sequence[str]) -> bool:
-    """Whether ``invert`` has positional arguments (model and file), which needs no trainer."""
-    return bool(arguments) and not arguments[0].startswith("-")
-
-
-def _gathered(arguments: list[str], option: str) -> list[str]:
-    """Collect leading positional arguments in a list for an option."""
-    count = next((index for index, argument in enumerate(arguments) if argument.startswith("-")), len(arguments))
-    return [f"--{option}={json.dumps(arguments[:count])}", *arguments[count:]] if count else arguments
-
-
-def _repeated(arguments: list[str], option: str) -> list[str]:
-    """Collect the values of a repeated option in a list."""
-    values, rest, left = [], [], iter(arguments)
-    for argument in left:
-        name, equals, value = argument.partition("=")
-        if name != f"--{option}":
-            rest.append(argument)
-            continue
-        if not (value := value if equals else next(left, "")):
-            raise UserError(f"{option}: expected a value, found none")
-        values.append(value)
-    return [*rest, f"--{option}={json.dumps(values)}"] if values else rest
-
-
 def _overview() -> str:
-    verbs = TRAINER_VERBS | COMMANDS
+    verbs = TRAINER_VERBS | {verb: command.summary for verb, command in COMMANDS.items()}
     width = max(map(len, verbs))
     lines = [f"  {verb:<{width}}  {summary}" for verb, summary in verbs.items()]
     usage = "usage: python -m ftl_lightning VERB [--help] [--config FILE] [--trust MODULE] ..."

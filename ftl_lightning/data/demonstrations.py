@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.data.features import Feature, InitialStates, Observed, take
-from ftl_lightning.services.data_names import read_from, written_to
 from ftl_lightning.services.errors import UserError, about, require, short
-from ftl_lightning.services.representation import Shown, counted
+from ftl_lightning.services.files import read_from, written_to
 from ftl_lightning.services.tensor_file import bytes_hash, serialise
+from ftl_lightning.services.text import Shown, counted
 
 KIND = "demonstrations"
 """Kind of a safetensors file of demonstrations."""

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.services.errors import UserError, require
-from ftl_lightning.services.representation import Shown
+from ftl_lightning.services.text import Shown
 
 Observed = Mapping[str, Tensor]
 """Observed features by name, each ``(sample, *shape)``; empty where nothing is observed."""

@@ -23,8 +23,8 @@ from ftl_lightning.domains.pictures import Show, line_drawings
 from ftl_lightning.domains.recorder import Recorder
 from ftl_lightning.domains.tasks import Suite, training_suite
 from ftl_lightning.services.errors import UserError, require, short, shown
-from ftl_lightning.services.representation import Shown, counted
-from ftl_lightning.services.seeding import VALIDATION_SEED
+from ftl_lightning.services.randomness import VALIDATION_SEED
+from ftl_lightning.services.text import Shown, counted
 
 ACCURACY = "accuracy"
 SUCCESS = "success"

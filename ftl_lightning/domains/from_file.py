@@ -38,7 +38,7 @@ from ftl_lightning.domains.domain import Concepts, Domain, Metric, Plans, Record
 from ftl_lightning.domains.recognition import Recognition
 from ftl_lightning.domains.recorder import drawn_by_hand
 from ftl_lightning.services.errors import about, require, short
-from ftl_lightning.services.seeding import generator
+from ftl_lightning.services.randomness import generator
 
 OWN = "own"
 """Name of the domain of user data."""

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.films import Frames, Shape, VectorFilm, Wireframe, some, still
-from ftl_lightning.services.escape import figure_text
+from ftl_lightning.services.text import figure_text
 
 if TYPE_CHECKING:  # importing matplotlib takes half a second
     from matplotlib.figure import Figure

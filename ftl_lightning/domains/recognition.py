@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.data.demonstrations import Demonstrations
-from ftl_lightning.services.seeding import generator
+from ftl_lightning.services.randomness import generator
 from ftl_lightning.services.spectrum import cosines
 
 STILL = 0.05

@@ -20,8 +20,8 @@ from ftl_lightning.evaluation.references import lines, real_behaviour, reference
 from ftl_lightning.evaluation.rows import config_hash, configuration, rows
 from ftl_lightning.evaluation.tensorboard import draw, log_projector, log_test, own_rows, setting_means
 from ftl_lightning.services.errors import require, shown
-from ftl_lightning.services.printing import say
-from ftl_lightning.services.ranges import check_count
+from ftl_lightning.services.text import say
+from ftl_lightning.services.validation import check_count
 from ftl_lightning.training.checkpoint import Random
 from ftl_lightning.training.data import InversionData, PretrainingData
 

@@ -17,9 +17,9 @@ from ftl_lightning.evaluation.pictures import captioned, gif, outcome_text
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.services.errors import UserError, require
-from ftl_lightning.services.representation import Shown, counted
-from ftl_lightning.services.seeding import generator
+from ftl_lightning.services.randomness import generator
 from ftl_lightning.services.tensor_file import atomic
+from ftl_lightning.services.text import Shown, counted
 from ftl_lightning.training.concept_model import ConceptModel
 
 

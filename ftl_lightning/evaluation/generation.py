@@ -19,8 +19,8 @@ from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.point import Point
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.services.errors import UserError, require, shown
-from ftl_lightning.services.ranges import MOST_TOGETHER, check_count, check_range
-from ftl_lightning.services.seeding import EVALUATION_SEED, generator, task_key
+from ftl_lightning.services.randomness import EVALUATION_SEED, generator, task_key
+from ftl_lightning.services.validation import MOST_TOGETHER, check_count, check_range
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.quality import right_plans
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from ftl_lightning.evaluation.generation import OWN
 from ftl_lightning.evaluation.row import Row
 from ftl_lightning.evaluation.summary import show, summary_table
-from ftl_lightning.services.printing import say
+from ftl_lightning.services.text import say
 
 
 def record(rows: Sequence[Row], results: str | None, folder: str | Path) -> None:

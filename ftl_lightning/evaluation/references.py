@@ -33,7 +33,7 @@ from ftl_lightning.evaluation.closed_loop import PlanFollower, fixed_plans, roll
 from ftl_lightning.evaluation.generation import TaskResult
 from ftl_lightning.services.errors import require
 from ftl_lightning.services.progress import bar
-from ftl_lightning.services.seeding import FRESH_SEED
+from ftl_lightning.services.randomness import FRESH_SEED
 from ftl_lightning.services.tensor_file import bytes_hash
 from ftl_lightning.training.quality import first_windows
 

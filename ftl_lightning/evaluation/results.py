@@ -11,7 +11,7 @@ import pandas as pd
 
 from ftl_lightning.evaluation.row import METHOD, REFERENCE, Row, label
 from ftl_lightning.services.errors import UserError, about, short, shown
-from ftl_lightning.services.limits import MOST_TEXT, check_readable
+from ftl_lightning.services.files import MOST_TEXT, check_readable
 from ftl_lightning.services.tensor_file import alone, atomic, visible
 
 FOLDER = r"\w[\w .+-]{0,99}"

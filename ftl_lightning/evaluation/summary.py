@@ -12,8 +12,7 @@ from rich.text import Text
 from ftl_lightning.domains.domain import COVERAGE, NOVELTY
 from ftl_lightning.evaluation.generation import LOST, OWN, WON, standard_error
 from ftl_lightning.evaluation.row import METHOD, REFERENCE, Row, label
-from ftl_lightning.services.escape import markdown
-from ftl_lightning.services.printing import line, say
+from ftl_lightning.services.text import line, markdown, say
 
 DIVERSITY = (NOVELTY, COVERAGE)
 

@@ -25,7 +25,7 @@ from ftl_lightning.evaluation.pictures import captioned, gif, outcome_text
 from ftl_lightning.evaluation.row import METHOD, Row
 from ftl_lightning.evaluation.summary import plain, summary_table
 from ftl_lightning.igm.point import Part, Point
-from ftl_lightning.services.printing import line
+from ftl_lightning.services.text import line
 from ftl_lightning.training.board import FILMS, PICTURES, RESULTS, ROLLOUTS
 from ftl_lightning.training.quality import first_windows
 

@@ -15,7 +15,7 @@ from ftl_lightning.domains.domain import Domain
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.samplers import Epsilon, Noise, Sampling
 from ftl_lightning.services.progress import Advance, bar
-from ftl_lightning.services.seeding import generator
+from ftl_lightning.services.randomness import generator
 from ftl_lightning.training.concept_model import ConceptModel
 
 

@@ -4,7 +4,7 @@ import math
 from typing import NamedTuple
 
 from ftl_lightning.services.errors import UserError, short
-from ftl_lightning.services.ranges import LARGEST_FACTOR
+from ftl_lightning.services.validation import LARGEST_FACTOR
 
 
 class Part(NamedTuple):
@@ -25,7 +25,7 @@ def parse_composition(text: str) -> list[Part]:
     """Parse a composition such as ``'circle right of square:1.2 + walk@legs,trunk:0.8'``; the default weight is 1.
 
     Raises:
-        UserError: for a weight that exceeds :data:`~ftl_lightning.services.ranges.LARGEST_FACTOR`, or an empty concept or
+        UserError: for a weight that exceeds :data:`~ftl_lightning.services.validation.LARGEST_FACTOR`, or an empty concept or
             group.
     """
     parts = []

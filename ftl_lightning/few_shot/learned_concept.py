@@ -13,8 +13,8 @@ from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.igm.explanation import Explanation, explain
 from ftl_lightning.igm.library import kept_file
-from ftl_lightning.services.arguments import check_whole
 from ftl_lightning.services.errors import UserError, short, shown
+from ftl_lightning.services.validation import check_whole
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.hub import upload
 from ftl_lightning.training.quality import Inspection, inspected

@@ -38,14 +38,13 @@ from ftl_lightning.igm.inversion import Watch
 from ftl_lightning.igm.library import Library, library
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.igm.settings import INVERSION
-from ftl_lightning.services.arguments import changed, check_path, check_text, check_whole, device_named
 from ftl_lightning.services.errors import UserError, require, short, shown
 from ftl_lightning.services.progress import bar
-from ftl_lightning.services.ranges import LARGEST_STEP
-from ftl_lightning.services.representation import Shown
-from ftl_lightning.services.seeding import EVALUATION_SEED
+from ftl_lightning.services.randomness import EVALUATION_SEED
 from ftl_lightning.services.shipped import pretrained_folder, shipped_models, shipped_name
+from ftl_lightning.services.text import Shown
 from ftl_lightning.services.trust import vouching
+from ftl_lightning.services.validation import LARGEST_STEP, changed, check_path, check_text, check_whole, device_named
 from ftl_lightning.training.checks import Check, check_concept, check_sizes, check_with, notes_of
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.hub import CONCEPT_FILES, download, is_repository, save_with_card, upload

@@ -25,12 +25,10 @@ from ftl_lightning.igm.concept import Concept
 from ftl_lightning.igm.library import CONCEPT
 from ftl_lightning.igm.summary import summary
 from ftl_lightning.services.errors import UserError, short
-from ftl_lightning.services.escape import markdown
-from ftl_lightning.services.limits import read_text
-from ftl_lightning.services.printing import line
-from ftl_lightning.services.representation import counted
-from ftl_lightning.services.seeding import generator
+from ftl_lightning.services.files import read_text
+from ftl_lightning.services.randomness import generator
 from ftl_lightning.services.tensor_file import atomic, write_text
+from ftl_lightning.services.text import counted, line, markdown
 from ftl_lightning.training.concept_model import ConceptModel
 
 CARD, FILM, PICTURE, DEMONSTRATIONS = "README.md", "film.gif", "picture.png", "demonstrations.safetensors"

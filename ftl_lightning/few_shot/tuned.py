@@ -7,9 +7,9 @@ from typing import Self
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.igm.settings import GROUPS, InversionSettings
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.schema import from_mapping
 from ftl_lightning.services.shipped import shipped
 from ftl_lightning.services.trust import is_installed, is_vouched
+from ftl_lightning.services.validation import from_mapping
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from torch import Tensor, nn
 from ftl_lightning.igm.diffusion import Denoiser
 from ftl_lightning.igm.forms.modes import Modes
 from ftl_lightning.services.errors import UserError, shown
-from ftl_lightning.services.ranges import check_range
-from ftl_lightning.services.representation import Shown, counted, numbers
+from ftl_lightning.services.text import Shown, counted, numbers
+from ftl_lightning.services.validation import check_range
 
 
 class Adapter(Protocol):

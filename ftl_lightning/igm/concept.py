@@ -13,11 +13,10 @@ from ftl_lightning.igm.forms.adapter import LowRank
 from ftl_lightning.igm.forms.modes import STRETCH, Modes
 from ftl_lightning.igm.point import Part
 from ftl_lightning.services.errors import UserError, about, short, shown
-from ftl_lightning.services.ranges import LARGEST_FACTOR, check_factor, check_range
-from ftl_lightning.services.representation import Shown, counted, numbers
-from ftl_lightning.services.schema import check_type, from_mapping
 from ftl_lightning.services.shipped import shipped
 from ftl_lightning.services.tensor_file import check_finite, load_tensors, save_tensors
+from ftl_lightning.services.text import Shown, counted, numbers
+from ftl_lightning.services.validation import LARGEST_FACTOR, check_factor, check_range, check_type, from_mapping
 
 KIND = "concept"
 VERSION = 5

@@ -20,7 +20,7 @@ from ftl_lightning.igm.forms.stopping import Stopping
 from ftl_lightning.igm.model import Invertible
 from ftl_lightning.igm.settings import CONCEPTS, EXPLAINED, REDUCED, InversionSettings
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.seeding import generator, task_key
+from ftl_lightning.services.randomness import generator, task_key
 
 FINAL_SAMPLES = 128
 """Number of noised demonstrations for the final loss, the same for all restarts."""

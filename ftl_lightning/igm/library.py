@@ -15,10 +15,9 @@ from typing import Literal
 from ftl_lightning.igm.concept import Concept, file_name
 from ftl_lightning.igm.summary import summary
 from ftl_lightning.services.errors import UserError, require, short, shown
-from ftl_lightning.services.printing import line, say
-from ftl_lightning.services.representation import Shown, counted
-from ftl_lightning.services.targets import check_writable_file
+from ftl_lightning.services.files import check_writable_file
 from ftl_lightning.services.tensor_file import data_folder, visible
+from ftl_lightning.services.text import Shown, counted, line, say
 
 Kind = Literal["training", "shipped", "saved"]
 CONCEPT = "concept.safetensors"

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ftl_lightning.igm.diffusion import clean_from_epsilon
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.ranges import check_count, check_factor
+from ftl_lightning.services.validation import check_count, check_factor
 
 Epsilon = Callable[[Tensor, Tensor], Tensor]
 Noise = Callable[[], Tensor]

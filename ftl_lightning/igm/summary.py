@@ -6,9 +6,9 @@ from pathlib import Path
 
 from ftl_lightning.igm.concept import ADAPTER, KIND, MODES, VERSION, Origin, QualityRecord
 from ftl_lightning.services.errors import UserError, about
-from ftl_lightning.services.representation import counted
-from ftl_lightning.services.schema import from_mapping
 from ftl_lightning.services.tensor_file import check_kind, load_header
+from ftl_lightning.services.text import counted
+from ftl_lightning.services.validation import from_mapping
 
 Shapes = Mapping[str, tuple[int, ...]]
 

@@ -12,9 +12,8 @@ from torch.nn import functional
 
 from ftl_lightning.data.features import Feature, Observed
 from ftl_lightning.services.errors import require, shown
-from ftl_lightning.services.processes import drawn
-from ftl_lightning.services.ranges import check_range
-from ftl_lightning.services.schema import from_mapping
+from ftl_lightning.services.randomness import drawn
+from ftl_lightning.services.validation import check_range, from_mapping
 
 MOST_POINTS = 1000
 MOST_PIXELS = 100_000_000

@@ -9,8 +9,8 @@ from torch.nn import functional
 from ftl_lightning.igm.diffusion import Context
 from ftl_lightning.networks.conditions import Sizes, condition_encoder, sinusoidal_embedding, turned
 from ftl_lightning.services.errors import require
-from ftl_lightning.services.processes import Dropout
-from ftl_lightning.services.ranges import check_range
+from ftl_lightning.services.randomness import Dropout
+from ftl_lightning.services.validation import check_range
 
 FEW = 8
 """Minimum number of rows in a product: with fewer, libraries sum in another order."""

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.services.errors import UserError, require, short
-from ftl_lightning.services.printing import say
 from ftl_lightning.services.tensor_file import cache_folder, content_hash, file_hash, load_tensors, save_tensors, visible
+from ftl_lightning.services.text import say
 
 if TYPE_CHECKING:
     from transformers import PreTrainedModel

@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from ftl_lightning.data.check import distances
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.reporting.figures import COLOURS, PAPER_COLOUR
-from ftl_lightning.services.escape import figure_text
-from ftl_lightning.services.extras import check_extra
+from ftl_lightning.services.shipped import check_extra
+from ftl_lightning.services.text import figure_text
 from ftl_lightning.training.checks import Check
 from ftl_lightning.training.concept_model import ConceptModel
 

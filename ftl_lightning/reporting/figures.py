@@ -18,7 +18,7 @@ from ftl_lightning.reporting.comparison import compared, methods, reference_line
 from ftl_lightning.reporting.measurements import NOISY, Measured, reached
 from ftl_lightning.reporting.table import lookup, main_omega, of_method, select, settings, summarise
 from ftl_lightning.reporting.tables import AXES, labelled, main_rows, points
-from ftl_lightning.services.escape import figure_text
+from ftl_lightning.services.text import figure_text
 
 _MODES_OVER_TIME = f"{WITH_MODES} {WITH_KNOTS}"
 OF_METHODS: Mapping[Compared, str] = {

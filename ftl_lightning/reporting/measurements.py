@@ -18,8 +18,8 @@ from ftl_lightning.domains.domain import Domain
 from ftl_lightning.evaluation.row import label
 from ftl_lightning.reporting.table import MISSING, Table, make_table, of_method, select
 from ftl_lightning.services.errors import UserError, shown
-from ftl_lightning.services.schema import from_mapping, read_json
 from ftl_lightning.services.tensor_file import write_text
+from ftl_lightning.services.validation import from_mapping, read_json
 
 T = TypeVar("T")
 SPEED = "speed.json"

@@ -23,11 +23,10 @@ from ftl_lightning.reporting.measurements import read_speed
 from ftl_lightning.reporting.table import decisive, domain_of, lookup, of_method, select, settings, summarise
 from ftl_lightning.reporting.tables import AXES, points
 from ftl_lightning.services.errors import UserError, require
-from ftl_lightning.services.printing import say
-from ftl_lightning.services.schema import read_json
-from ftl_lightning.services.shipped import shipped
+from ftl_lightning.services.shipped import FILM, shipped
 from ftl_lightning.services.tensor_file import visible, write_text
-from ftl_lightning.services.web import FILM
+from ftl_lightning.services.text import say
+from ftl_lightning.services.validation import read_json
 from ftl_lightning.training.model_folder import load_model
 from ftl_lightning.version import __version__
 

@@ -26,9 +26,9 @@ from ftl_lightning.reporting.measurements import FRONTIER, frontier_table, read_
 from ftl_lightning.reporting.table import Table, domain_of, metrics, of_method, select
 from ftl_lightning.reporting.tables import as_learned_most, changes_table, curves_table, tables
 from ftl_lightning.services.errors import require, shown
-from ftl_lightning.services.limits import read_text
-from ftl_lightning.services.printing import say
+from ftl_lightning.services.files import read_text
 from ftl_lightning.services.tensor_file import atomic, write_text
+from ftl_lightning.services.text import say
 
 BEGIN, END = "<!-- results: begin -->", "<!-- results: end -->"
 """Lines around the text that ``report --readme`` writes."""

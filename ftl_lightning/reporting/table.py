@@ -15,8 +15,7 @@ from ftl_lightning.domains.registry import domain_of_file, is_known
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.evaluation.generation import LOST, WON, standard_error
 from ftl_lightning.services.errors import UserError, require, shown
-from ftl_lightning.services.escape import latex, latex_row, markdown
-from ftl_lightning.services.printing import say
+from ftl_lightning.services.text import latex, latex_row, markdown, say
 
 MISSING = "-"
 PAPERS = ("paper", "difference")

@@ -19,7 +19,7 @@ Interpolations such as ``${seed_everything}`` are not resolved.
 import copy
 import functools
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -27,14 +27,13 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from ftl_lightning.services.errors import UserError, short
-from ftl_lightning.services.limits import check_readable
+from ftl_lightning.services.errors import UserError, require, short
+from ftl_lightning.services.files import check_readable
 from ftl_lightning.services.shipped import shipped
 
 DEFAULTS = "defaults"
 SECTIONS = ("fit", "invert")
 """Keys whose content applies to a single verb."""
-_OPTIONS = ("--config", "-c")
 
 
 def section_of(verb: str) -> str | None:
@@ -49,7 +48,7 @@ def find(path: str | Path) -> Path:
         UserError: if there is none, with nearby files.
     """
     file = shipped(path)
-    if not file.is_file():
+    if not file.is_file():  # the message reads folders
         raise UserError(f"{path}: expected a configuration file, found {'a folder' if file.is_dir() else 'nothing'}{_near(path)}")
     return file
 
@@ -102,15 +101,14 @@ def _merged(path: Path, section: str | None, above: tuple[Path, ...]) -> Iterato
         raise UserError(f"{above[-1]}: key '{DEFAULTS}': {path} builds on {above[-1]} itself; leave one of them out")
     keys = _read(path)
     names = keys.pop(DEFAULTS, None) or []
-    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise UserError(f"{path}: key '{DEFAULTS}': expected a list of configuration files, found {short(str(names))}")
+    valid = isinstance(names, list) and all(isinstance(name, str) for name in names)
+    require(valid, f"{path}: key '{DEFAULTS}'", "a list of configuration files", short(str(names)))
     for name in names:
         yield from _merged(_beside(path, name), section, (*above, path))
     sections = {} if section is None else {name: keys.pop(name, None) for name in SECTIONS}
     yield path, keys
     for name, content in sections.items():
-        if content is not None and not isinstance(content, dict):
-            raise UserError(f"{path}: key '{name}': expected a mapping of keys, found {short(str(content))}")
+        require(isinstance(content, dict | None), f"{path}: key '{name}'", "a mapping of keys", short(str(content)))
     if section and (content := sections[section]) is not None:
         yield path, _plain(content)
 
@@ -127,8 +125,8 @@ def _beside(path: Path, name: str) -> Path:
     except (OSError, ValueError) as error:  # a name that no file can have, or a folder that cannot be read
         reason = getattr(error, "strerror", None) or str(error)
         raise UserError(f"{path}: key '{DEFAULTS}': expected configuration files, found {short(name, 150)} ({reason})") from error
-    message = f"found no {short(name, 150)} beside it or in a folder above it"
-    raise UserError(f"{path}: key '{DEFAULTS}': expected configuration files, {message}")
+    missing = f"no {short(name, 150)} beside it or in a folder above it"
+    raise UserError(f"{path}: key '{DEFAULTS}': expected configuration files, found {missing}")
 
 
 def _relative(path: Path) -> Path:
@@ -151,8 +149,7 @@ def _read(path: Path) -> dict[str, Any]:
     ) as error:
         reason = short(str(error), 200) or "no mapping of keys"
         raise UserError(f"{path}: expected a configuration file (YAML), found {reason}") from error
-    if not isinstance(keys, dict):
-        raise UserError(f"{path}: expected a mapping of keys, found a list")
+    require(isinstance(keys, dict), str(path), "a mapping of keys", "a list")
     return _plain(copy.deepcopy(keys))
 
 
@@ -164,35 +161,3 @@ def _parsed(text: str) -> object:
 
 LONGEST = 200_000
 """Maximum size of a configuration file in bytes; OmegaConf bounds the expansion of aliases."""
-
-
-def configurations(arguments: Sequence[str]) -> list[str]:
-    """Configuration files of a command line, in order."""
-    return [value for _, _, value in _given(arguments)]
-
-
-def expanded(arguments: Sequence[str], verb: str = "") -> list[str]:
-    """Replace configuration files in a command line by their content from :func:`load`.
-
-    Raises:
-        UserError: as :func:`load`.
-    """
-    result = list(arguments)
-    for index, prefix, value in _given(arguments):
-        result[index] = prefix + OmegaConf.to_yaml(OmegaConf.create(load(value, verb)))
-    return result
-
-
-def _given(arguments: Sequence[str]) -> Iterator[tuple[int, str, str]]:
-    """Index of the argument, prefix and path for each configuration file.
-
-    Inline configurations (``--config '{seed_everything: 1}'``) are skipped.
-    """
-    for index, argument in enumerate(arguments):
-        option, equals, value = argument.partition("=")
-        if argument in _OPTIONS and index + 1 < len(arguments):
-            index, equals, option, value = index + 1, "", "", arguments[index + 1]
-        elif option not in _OPTIONS or not equals:
-            continue
-        if "\n" not in value and not value.lstrip().startswith("{"):
-            yield index, option + equals, value

@@ -10,8 +10,8 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.targets import check_writable_folder
+from ftl_lightning.services.errors import require
+from ftl_lightning.services.files import check_writable_folder
 
 LOCK = ".running"
 """File in the folder of an active run, which locks it."""
@@ -73,10 +73,8 @@ def hold(folder: Path) -> None:
     Raises:
         UserError: if another run holds it.
     """
-    if not _claimed(folder, new=False):
-        raise UserError(
-            f"{folder}: expected the log folder of a run that has ended, found that of one that goes on; wait for its end"
-        )
+    free = _claimed(folder, new=False)
+    require(free, str(folder), "the log folder of a run that has ended", "that of a run that goes on; wait for its end")
 
 
 def _numbered(name: str) -> Iterator[str]:

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
-from ftl_lightning.services.printing import plain, say
+from ftl_lightning.services.text import plain, say
 
 if TYPE_CHECKING:
     from rich.progress import Progress

@@ -1,13 +1,11 @@
-"""Shipped files: configurations (``conf/...``) and pretrained models (``pretrained/...``).
-
-Both folders are at the root of the repository; the package has links to them, which are folders in a wheel. So the documented
-paths work in a checkout and, after ``pip install``, in any folder.
-"""
+"""Shipped files and optional packages."""
 
 import difflib
+import importlib.util
+from collections.abc import Mapping
 from pathlib import Path
 
-from ftl_lightning.services.errors import short
+from ftl_lightning.services.errors import UserError, short
 
 FOLDERS = ("conf", "pretrained")
 """Shipped folders."""
@@ -16,6 +14,8 @@ CONFIGURATIONS = _PACKAGE / "conf"
 """Folder of the shipped configuration files."""
 MODELS = _PACKAGE / "pretrained"
 """Folder of the shipped models."""
+FILM = Path(__file__).parent / "film.js"
+"""Script that draws films on a page. It contains ``"use strict"``, so it must be the first script."""
 
 
 def shipped(path: str | Path) -> Path:
@@ -74,3 +74,32 @@ def shipped_name(folder: Path) -> str:
     """Name of a shipped model, such as ``agent``, by its folder; empty for other folders."""
     place, models = folder.resolve(), MODELS.resolve()
     return place.relative_to(models).as_posix() if place.is_relative_to(models) and place != models else ""
+
+
+EXTRAS: Mapping[str, Mapping[str, str]] = {
+    "driving": {"highway_env": "highway-env", "gymnasium": "gymnasium"},
+    "lerobot": {"pyarrow": "pyarrow"},
+    "minari": {"minari": "minari"},
+    "mocap": {"sklearn": "scikit-learn"},
+    "navigation": {"pybullet": "pybullet", "gymnasium": "gymnasium"},
+    "notebooks": {"sklearn": "scikit-learn"},
+    "play": {"starlette": "starlette", "uvicorn": "uvicorn"},
+    "tabletop": {"pybullet": "pybullet", "gymnasium": "gymnasium"},
+}
+"""Late-imported modules and their packages, by extra."""
+
+
+def check_extra(extra: str, user: str) -> None:
+    """Require an extra's packages; nothing is imported.
+
+    Args:
+        extra: a key of :data:`EXTRAS`.
+        user: subject of the error message: what needs the packages.
+
+    Raises:
+        UserError: with the command that installs them.
+    """
+    for module, package in EXTRAS[extra].items():
+        if importlib.util.find_spec(module) is None:
+            command = f"pip install 'ftl-lightning[{extra}]'"
+            raise UserError(f"{user} needs the package {package}, which is not installed; {command}")

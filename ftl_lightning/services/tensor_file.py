@@ -15,10 +15,9 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
-from ftl_lightning.services.errors import UserError, about, short, shown
-from ftl_lightning.services.limits import MOST_HEADER, MOST_TENSORS, check_readable, raised
-from ftl_lightning.services.schema import parse_json
-from ftl_lightning.services.targets import check_file
+from ftl_lightning.services.errors import UserError, about, require, short, shown
+from ftl_lightning.services.files import MOST_HEADER, MOST_TENSORS, check_file, check_readable, raised
+from ftl_lightning.services.validation import parse_json
 
 _HEADER = "ftl_lightning"
 FORMAT = 1
@@ -208,8 +207,9 @@ def check_kind(header: object, kind: str, version: int = FORMAT) -> dict[str, An
     if not isinstance(header, dict) or actual != kind:
         message = f"a {short(str(actual))} file" if actual else "a file of other software"
         raise UserError(f"expected a {kind} file, found {message}")
-    if header.get("format") != version or isinstance(header["format"], bool):
-        raise UserError(f"key 'format': expected {version}, found {shown(header.get('format'))}; it is of another version")
+    actual = header.get("format")
+    same = actual == version and not isinstance(actual, bool)
+    require(same, "key 'format'", str(version), f"{shown(actual)}; it is of another version")
     return header
 
 
@@ -240,12 +240,11 @@ def check_header(path: Path, kind: str, size: int) -> None:
     with path.open("rb") as file:
         length = int.from_bytes(file.read(8), "little")
         most = raised(MOST_HEADER)
-        if length > min(size, most):
-            message = "a damaged or foreign file" if length > size else f"a header of {length} bytes, more than {most}"
-            raise UserError(f"{path}: expected a {kind} file, found {message}")
+        message = "a damaged or foreign file" if length > size else f"a header of {length} bytes, more than {most}"
+        require(length <= min(size, most), str(path), f"a {kind} file", message)
         # Each tensor is a mapping, however its keys are written; braces in texts are too few to matter.
-        if (tensors := file.read(length).count(b"{")) > MOST_TENSORS:
-            raise UserError(f"{path}: expected a {kind} file of at most {MOST_TENSORS} tensors, found {tensors}")
+        tensors = file.read(length).count(b"{")
+        require(tensors <= MOST_TENSORS, str(path), f"a {kind} file of at most {MOST_TENSORS} tensors", tensors)
 
 
 def check_finite(tensors: Mapping[str, Tensor], where: str, advice: str) -> None:
@@ -255,8 +254,7 @@ def check_finite(tensors: Mapping[str, Tensor], where: str, advice: str) -> None
         UserError: naming the first such tensor.
     """
     for name, value in tensors.items():
-        if not value.isfinite().all():
-            raise UserError(f"{where}: expected finite numbers, found others in {short(name)!r}; {advice}")
+        require(value.isfinite().all(), where, "finite numbers", f"others in {short(name)!r}; {advice}")
 
 
 def bytes_hash(content: bytes) -> str:

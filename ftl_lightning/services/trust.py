@@ -10,14 +10,16 @@ import importlib.machinery
 import os
 import re
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib.metadata import EntryPoint, distributions
 from pathlib import Path
 
-from ftl_lightning.services.errors import UserError, about, short
+from ftl_lightning.services.command_line import Arguments
+from ftl_lightning.services.errors import about, require, short
 
-OPTION = "--trust"
+_TRUST = "trust"
+OPTION = f"--{_TRUST}"
 """Option that trusts a module, wherever it is named, the current folder included."""
 NO_CODE = ("ftl_lightning.conf", "ftl_lightning.pretrained")
 """Folders of the package with data files of others and never a module."""
@@ -90,11 +92,12 @@ def vouching(names: Iterable[str]) -> Iterator[None]:
 
 
 @contextmanager
-def person(arguments: Sequence[str]) -> Iterator[list[str]]:
+def person(verb: str, arguments: Arguments) -> Iterator[Arguments]:
     """Trust names in a command line, and remove the current folder from Python's path unless a module in it is named.
 
     Args:
-        arguments: arguments of the program, the verb first.
+        verb: the verb.
+        arguments: arguments after the verb.
 
     Yields:
         The arguments without :data:`OPTION`.
@@ -102,8 +105,11 @@ def person(arguments: Sequence[str]) -> Iterator[list[str]]:
     Raises:
         UserError: for an option without a module.
     """
-    names, rest = _trusted(arguments)
-    names |= _named(rest)
+    names = set(arguments.values(_TRUST))
+    for name in names:
+        require(_CLASS.fullmatch(name) or name.isidentifier(), OPTION, "the name of a module such as my_domain", repr(short(name)))
+    arguments = arguments.without(_TRUST)
+    names |= _named(verb, arguments)
     before, safe = list(sys.path), os.environ.get(_SAFE_PATH)
     sys.path[:] = search_path()
     os.environ[_SAFE_PATH] = "1"  # for worker processes, whose path would include the current folder
@@ -111,7 +117,7 @@ def person(arguments: Sequence[str]) -> Iterator[list[str]]:
         sys.path.append(_appended())
     try:
         with vouching(names):
-            yield rest
+            yield arguments
     finally:
         sys.path[:] = before
         if safe is None:
@@ -120,35 +126,17 @@ def person(arguments: Sequence[str]) -> Iterator[list[str]]:
             os.environ[_SAFE_PATH] = safe
 
 
-def _trusted(arguments: Sequence[str]) -> tuple[set[str], list[str]]:
-    """Modules named by :data:`OPTION`, and the arguments without it."""
-    names, rest, left = set(), [], iter(arguments)
-    for argument in left:
-        option, equals, value = argument.partition("=")
-        if option != OPTION:
-            rest.append(argument)
-            continue
-        name = value if equals else next(left, "")
-        if not _CLASS.fullmatch(name) and not name.isidentifier():
-            raise UserError(f"{OPTION}: expected the name of a module such as my_domain, found {short(name)!r}")
-        names.add(name)
-    return names, rest
-
-
-def _named(arguments: Sequence[str]) -> set[str]:
+def _named(verb: str, arguments: Arguments) -> set[str]:
     """Domains ``module:ATTRIBUTE`` and modules of classes in the command line itself."""
-    names = set()
-    if len(arguments) > 1 and arguments[0] in _POSITIONAL and _REFERENCE.fullmatch(arguments[1]):
-        names.add(arguments[1])
-    for argument, following in zip(arguments, [*arguments, ""][1:], strict=True):
-        option, equals, value = argument.partition("=")
-        value = value if equals else following
-        last = option.lstrip("-").rstrip("+").rpartition(".")[2]
-        if option.startswith("-") and last == "domain" and _REFERENCE.fullmatch(value):
+    first = arguments.positional[:1] if verb in _POSITIONAL else ()
+    names = {domain for domain in first if _REFERENCE.fullmatch(domain)}
+    for option, value in arguments.options:
+        last, value = option.rstrip("+").rpartition(".")[2], value or ""
+        if last == "domain" and _REFERENCE.fullmatch(value):
             names.add(value)
-        if option.startswith("-") and last in _CLASSES and _CLASS.fullmatch(value):
+        if last in _CLASSES and _CLASS.fullmatch(value):
             names.add(value.rpartition(".")[0])
-        for key, inside in _INLINE.findall(argument):  # --config '{data: {class_path: my_data.Data}}'
+        for key, inside in _INLINE.findall(value):  # --config '{data: {class_path: my_data.Data}}'
             if (_REFERENCE if key == "domain" else _CLASS).fullmatch(inside):
                 names.add(inside if key == "domain" else inside.rpartition(".")[0])
     return names
@@ -177,11 +165,9 @@ def check_module(reference: str, key: str) -> None:
         UserError: with the key and the module.
     """
     module = reference.partition(":")[0]
-    if not is_installed(module) and not is_vouched(reference):
-        raise UserError(
-            f"key {short(key)!r}: expected an installed module, found {short(module)!r}, which was not imported; install its "
-            f"package, or if it is in the current folder and you trust it, add {OPTION} {short(module)}"
-        )
+    advice = f"install its package, or if it is in the current folder and you trust it, add {OPTION} {short(module)}"
+    refused = f"{short(module)!r}, which was not imported; {advice}"
+    require(is_installed(module) or is_vouched(reference), f"key {short(key)!r}", "an installed module", refused)
 
 
 def allowed(keys: object) -> set[str]:

@@ -19,7 +19,7 @@ from ftl_lightning.igm.library import concept_files, write_concept
 from ftl_lightning.igm.point import NEW_COMPONENT, Point
 from ftl_lightning.services import log_folder
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.printing import say
+from ftl_lightning.services.text import say
 from ftl_lightning.training.checks import longer_than_plans, notes_of
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.data import InversionData

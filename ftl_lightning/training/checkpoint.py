@@ -14,7 +14,7 @@ from packaging.version import InvalidVersion, Version
 from torch import Tensor
 
 from ftl_lightning.services.errors import UserError, require, shown
-from ftl_lightning.services.limits import check_readable
+from ftl_lightning.services.files import check_readable
 from ftl_lightning.services.tensor_file import atomic, check_finite, visible
 
 SIGNATURE = "belongs_to"

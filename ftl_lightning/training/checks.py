@@ -17,7 +17,7 @@ from ftl_lightning.igm.forms.leave_one_out import LeaveOneOut, leave_one_out, re
 from ftl_lightning.igm.settings import InversionSettings
 from ftl_lightning.services.errors import UserError, about, require, short
 from ftl_lightning.services.progress import bar
-from ftl_lightning.services.representation import counted
+from ftl_lightning.services.text import counted
 from ftl_lightning.training.concept_model import ConceptModel
 
 MARGIN, MOST_OF = 0.97, 0.8

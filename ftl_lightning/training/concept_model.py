@@ -22,9 +22,9 @@ from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.igm.settings import ADAPTED, AUTO, MIXED, MODES, ONE, PAPER, InversionSettings
 from ftl_lightning.networks.image_encoder import ImageEncoders
 from ftl_lightning.services.errors import UserError, require, short, shown
-from ftl_lightning.services.processes import drawn
-from ftl_lightning.services.representation import Shown, counted
+from ftl_lightning.services.randomness import drawn
 from ftl_lightning.services.tensor_file import bytes_hash, serialise
+from ftl_lightning.services.text import Shown, counted
 from ftl_lightning.training.method import Method
 from ftl_lightning.training.model_config import ModelConfig, Prepared, find_view
 

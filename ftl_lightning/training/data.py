@@ -21,9 +21,8 @@ from ftl_lightning.domains.from_file import OWN, domain_from_file, read_demonstr
 from ftl_lightning.domains.registry import load_domain, recorded_name
 from ftl_lightning.networks.text_encoder import Encoder, load_encoder
 from ftl_lightning.services.errors import UserError, short
-from ftl_lightning.services.processes import drawn, rows_of
-from ftl_lightning.services.ranges import LARGEST, LARGEST_STEP, MOST_TOGETHER, check_count, check_factor, check_range
-from ftl_lightning.services.seeding import DEMONSTRATION_SEED, generator
+from ftl_lightning.services.randomness import DEMONSTRATION_SEED, drawn, generator, rows_of
+from ftl_lightning.services.validation import LARGEST, LARGEST_STEP, MOST_TOGETHER, check_count, check_factor, check_range
 
 
 class Batch(NamedTuple):

@@ -14,8 +14,8 @@ from ftl_lightning.igm.concept import Concept
 from ftl_lightning.igm.settings import InversionSettings
 from ftl_lightning.services import trust
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.printing import silence
 from ftl_lightning.services.progress import bar
+from ftl_lightning.services.text import silence
 from ftl_lightning.training.model_folder import load_model
 
 

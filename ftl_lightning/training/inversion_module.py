@@ -22,7 +22,7 @@ from ftl_lightning.igm.settings import (
 )
 from ftl_lightning.services.option_groups import flat, groups_of
 from ftl_lightning.services.progress import bar
-from ftl_lightning.services.representation import counted
+from ftl_lightning.services.text import counted
 from ftl_lightning.training.adaptation import Adaptation
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.in_processes import learned_in_processes

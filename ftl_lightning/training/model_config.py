@@ -13,9 +13,8 @@ from ftl_lightning.domains.domain import Domain, View
 from ftl_lightning.domains.from_file import OWN
 from ftl_lightning.networks.conditions import Sizes
 from ftl_lightning.services.errors import UserError, about, short, shown
-from ftl_lightning.services.ranges import LARGEST, check_range
-from ftl_lightning.services.schema import check_type, read_json
 from ftl_lightning.services.shipped import missing_model
+from ftl_lightning.services.validation import LARGEST, check_range, check_type, read_json
 
 CONFIG = "config.json"
 """File name in a model's folder."""

@@ -16,9 +16,9 @@ from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.from_file import OWN, own_domain
 from ftl_lightning.domains.registry import domain_of_file, is_known, load_domain
 from ftl_lightning.services.errors import UserError, about, short
-from ftl_lightning.services.schema import from_mapping
 from ftl_lightning.services.shipped import pretrained_folder
 from ftl_lightning.services.tensor_file import alone, check_finite, file_hash, load_tensors, save_tensors, write_text
+from ftl_lightning.services.validation import from_mapping
 from ftl_lightning.training.concept_model import KIND, ConceptModel
 from ftl_lightning.training.method import kinds, model_class
 from ftl_lightning.training.model_config import CONFIG, VERSION, blank, check_domain, read_config

@@ -24,10 +24,9 @@ from ftl_lightning.networks.image_encoder import ImageEncoders
 from ftl_lightning.networks.text_encoder import EMPTY
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.option_groups import groups_of
-from ftl_lightning.services.processes import mean, rows_of
-from ftl_lightning.services.ranges import LARGEST_FACTOR, LARGEST_RATE, check_factor, check_range
-from ftl_lightning.services.seeding import generator
+from ftl_lightning.services.randomness import generator, mean, rows_of
 from ftl_lightning.services.tensor_file import check_finite
+from ftl_lightning.services.validation import LARGEST_FACTOR, LARGEST_RATE, check_factor, check_range
 from ftl_lightning.training.checkpoint import SIGNATURE, Random, check_parameters, check_restored, check_signature
 from ftl_lightning.training.concept_model import ConceptModel, joined_vectors
 from ftl_lightning.training.data import Batch, PretrainingData

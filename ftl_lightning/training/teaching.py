@@ -10,7 +10,7 @@ from ftl_lightning.data.features import READ, Observed, take
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.networks.image_encoder import ImageEncoders
 from ftl_lightning.services.errors import UserError, short
-from ftl_lightning.services.ranges import LARGEST_FACTOR, check_range
+from ftl_lightning.services.validation import LARGEST_FACTOR, check_range
 from ftl_lightning.training.data import Batch
 
 

@@ -1,8 +1,10 @@
-"""Lightning's trainer with the additional verb ``invert``."""
+"""Lightning's trainer with the additional verb ``invert``, on one device or in several processes by DDP."""
 
 import inspect
 import math
 import os
+import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -10,73 +12,78 @@ from typing import Any
 import lightning.pytorch as pl
 from lightning.pytorch.accelerators import CPUAccelerator
 from lightning.pytorch.plugins.io import TorchCheckpointIO
+from lightning.pytorch.strategies import DDPStrategy
+from lightning.pytorch.strategies.launchers import _SubprocessScriptLauncher  # no public name: tells processes from threads
+from lightning.pytorch.utilities import rank_zero_only
 
 from ftl_lightning.services import log_folder
-from ftl_lightning.services.errors import UserError, require, short
-from ftl_lightning.services.printing import silence
-from ftl_lightning.services.ranges import check_count, check_range
-from ftl_lightning.training import process_group
+from ftl_lightning.services.errors import UserError, mistake_behind, mistake_of_machine, require, short
+from ftl_lightning.services.text import line, silence
+from ftl_lightning.services.validation import check_count, check_range
 from ftl_lightning.training.adaptation import Adaptation
+from ftl_lightning.training.board import LearningRate
 from ftl_lightning.training.checkpoint import WholeCheckpoints
-from ftl_lightning.training.learning_rate import LearningRate
 
-HARMLESS = {
-    "accelerator",
-    "barebones",
-    "callbacks",
-    "check_val_every_n_epoch",
-    "default_root_dir",
-    "detect_anomaly",
-    "devices",
-    "enable_autolog_hparams",
-    "enable_checkpointing",
-    "enable_model_summary",
-    "enable_progress_bar",
-    "inference_mode",
-    "limit_predict_batches",
-    "limit_test_batches",
-    "limit_val_batches",
-    "log_every_n_steps",
-    "logger",
-    "model_registry",
-    "num_nodes",
-    "num_sanity_val_steps",
-    "profiler",
-    "reload_dataloaders_every_n_epochs",
-    "val_check_interval",
+NUMBERS = {
+    "accumulate_grad_batches",
+    "benchmark",
+    "deterministic",
+    "fast_dev_run",
+    "gradient_clip_algorithm",
+    "gradient_clip_val",
+    "limit_train_batches",
+    "max_epochs",
+    "max_steps",
+    "max_time",
+    "min_epochs",
+    "min_steps",
+    "overfit_batches",
+    "plugins",
+    "precision",
+    "strategy",
+    "sync_batchnorm",
+    "use_distributed_sampler",
 }
-"""Options that change no number of a run on one device; all other options do."""
-MOST_PROCESSES = 256
-"""Maximum number of processes that learn concepts."""
-_STARTS = ("`val_check_interval`", "Early stopping conditioned")
-"""Beginnings of Lightning's messages about options."""
+"""Options that can change the numbers of a run on one device."""
 USUAL = {"max_epochs": 1, "deterministic": True}
 """Defaults of the shipped configurations of ``invert`` that differ from Lightning's."""
+LEAST = {
+    -1: ("devices", "max_steps", "max_epochs", "num_sanity_val_steps"),
+    0: ("min_steps", "min_epochs", "log_every_n_steps", "reload_dataloaders_every_n_epochs", "gradient_clip_val"),
+    1: ("num_nodes", "check_val_every_n_epoch", "accumulate_grad_batches"),
+}
+"""Options by their minimum, which Lightning does not check: smaller values fail during a run, or are ignored."""
+MOST_DEVICES, MOST_PROCESSES = 10_000, 256
+"""Maximum number of devices or nodes, and of processes that learn concepts."""
+SHARES = ("limit_train_batches", "limit_val_batches", "limit_test_batches", "overfit_batches", "val_check_interval")
+"""Options that are a share or a number, which Lightning does not check."""
+_STARTS = ("`val_check_interval`", "Early stopping conditioned")
+"""Beginnings of Lightning's messages about options."""
+_LOST = ("gloo", "NCCL", "Connection closed", "Connection reset", "Broken pipe", "TCPStore", "store->get")
+"""Fragments of torch's messages to a process that waits for a process that ended."""
 
 
-RANGES = {
-    "devices": (-1, 10_000),
-    "num_nodes": (1, 1000),
-    "max_steps": (-1, math.inf),
-    "max_epochs": (-1, math.inf),
-    "min_steps": (0, math.inf),
-    "min_epochs": (0, math.inf),
-    "check_val_every_n_epoch": (1, math.inf),
-    "log_every_n_steps": (0, math.inf),
-    "accumulate_grad_batches": (1, math.inf),
-    "num_sanity_val_steps": (-1, math.inf),
-    "reload_dataloaders_every_n_epochs": (0, math.inf),
-    "gradient_clip_val": (0, math.inf),
-}
-"""Ranges of options that Lightning does not check: invalid values fail during a run, or are ignored."""
-LIMITS = {
-    "limit_train_batches": "batches",
-    "limit_val_batches": "batches",
-    "limit_test_batches": "batches",
-    "overfit_batches": "batches",
-    "val_check_interval": "steps",
-}
-"""Unchecked options that are a share or a number, with the unit of the number."""
+class LostProcess(UserError):
+    """Another process of the run has ended early."""
+
+
+@contextmanager
+def one_voice() -> Iterator[None]:
+    """Silence a process that another process started, within the block; its errors are a line, or none if another one ended."""
+    if not getattr(rank_zero_only, "rank", 0):
+        yield
+        return
+    silence()
+    warnings.simplefilter("ignore")
+    try:
+        yield
+    except LostProcess:
+        raise SystemExit(2) from None
+    except Exception as error:
+        if (mistake := mistake_behind(error) or mistake_of_machine(error)) is None:
+            raise
+        sys.stderr.write(f"error: {line(str(mistake))}\n")
+        raise SystemExit(2) from None
 
 
 class _Begun(pl.Callback):
@@ -117,19 +124,7 @@ class Trainer(pl.Trainer):
     def __init__(self, *arguments: Any, processes: int = 1, **options: Any) -> None:
         check_count("trainer.processes", processes, 1, MOST_PROCESSES)
         self.processes = processes
-        for name, (least, most) in RANGES.items():
-            value = options.get(name)
-            value = int(value) if isinstance(value, str) and value.isdecimal() else value  # devices may be a string
-            if isinstance(value, int | float) and not isinstance(value, bool):
-                check_range(f"trainer.{name}", value, least, most)
-        for name, words in LIMITS.items():
-            value = options.get(name)
-            if isinstance(value, int | float) and not (0 <= value <= 1 or (value > 1 and value == int(value))):
-                raise UserError(f"trainer.{name}: expected a share from 0 to 1 or a whole number of {words}, found {value}")
-        if options.get("val_check_interval") == 0:
-            raise UserError(
-                "trainer.val_check_interval: expected more than 0, found 0; trainer.limit_val_batches 0 validates never"
-            )
+        _check_options(options)
         try:
             super().__init__(*arguments, **options)
         except UserError:
@@ -143,45 +138,66 @@ class Trainer(pl.Trainer):
         self.unusual = {
             name: value if isinstance(value, int | float | str | None) else type(value).__name__
             for name, value in options.items()
-            if name not in HARMLESS and value != usual.get(name)
+            if name in NUMBERS and value != usual.get(name)
         }
-        process_group.take_over(self)
         self.callbacks += [_Begun(), LearningRate()]  # type: ignore[attr-defined]
         if type(self.strategy.checkpoint_io) is TorchCheckpointIO:  # unless it is configured
             self.strategy.checkpoint_io = WholeCheckpoints()
+
+    def check_alone(self, verb: str) -> None:
+        """Refuse several processes for a verb that runs in one process.
+
+        Raises:
+            UserError: naming the verb.
+        """
+        instead = "use trainer.processes" if verb == "invert" else "`fit` alone runs on several"
+        processes = self.num_devices * self.num_nodes
+        require(processes == 1, "trainer.devices", f"1 for {verb}", f"{processes}; {instead}")
 
     def fit(self, model: pl.LightningModule, *arguments: Any, **options: Any) -> None:
         """Lightning's ``fit``, for models that learn."""
         if isinstance(model, Adaptation) and not model.learns:
             raise UserError(f"verb: expected invert (model.class_path: {type(model).__name__} learns nothing), found fit")
         for key, length in (("max_steps", self.max_steps), ("max_epochs", self.max_epochs)):
-            if length == 0:
-                raise UserError(f"trainer.{key}: expected 1 or more, or -1 for no limit, found 0, with which nothing is learned")
-        if self.limit_train_batches == 0:
-            raise UserError("trainer.limit_train_batches: expected more than 0, found 0, with which nothing is learned")
-        process_group.check_exact(self)
+            require(length != 0, f"trainer.{key}", "1 or more, or -1 for no limit", "0, with which nothing is learned")
+        require(self.limit_train_batches != 0, "trainer.limit_train_batches", "more than 0", "0, with which nothing is learned")
+        self._check_exact()
         if self.global_rank:
             silence()
         with self._restoring():
             try:
                 super().fit(model, *arguments, **options)
-            except (ValueError, RuntimeError) as error:  # raised by Lightning at the start
+            except (ValueError, RuntimeError) as error:
                 if str(error).strip().startswith(_STARTS):
                     raise UserError(f"trainer: {short(str(error), 250)}") from error
+                if self.world_size > 1 and any(words in str(error) for words in _LOST):
+                    expected = f"expected {self.world_size} processes to the end, the connection to one was lost"
+                    raise LostProcess(f"trainer.devices: {expected}; go on with --ckpt_path last") from error
                 raise
         _expect_monitors(self)
 
     def validate(self, *arguments: Any, **options: Any) -> Any:
         """Lightning's ``validate``, in one process."""
-        process_group.check_alone(self, "validate")
+        self.check_alone("validate")
         with self._restoring():
             return super().validate(*arguments, **options)
 
     def test(self, *arguments: Any, **options: Any) -> Any:
         """Lightning's ``test``, in one process."""
-        process_group.check_alone(self, self.verb if self.verb == "invert" else "test")
+        self.check_alone(self.verb if self.verb == "invert" else "test")
         with self._restoring():
             return super().test(*arguments, **options)
+
+    def _check_exact(self) -> None:
+        """Refuse several processes unless each is started separately and holds all weights.
+
+        Raises:
+            UserError: naming the strategy.
+        """
+        separate = isinstance(self.strategy.launcher, _SubprocessScriptLauncher | None)
+        exact = self.world_size == 1 or (separate and isinstance(self.strategy, DDPStrategy))
+        name = f"{type(self.strategy).__name__} with {type(self.strategy.launcher).__name__}"
+        require(exact, "trainer.strategy", "ddp for several processes", name)
 
     @contextmanager
     def _restoring(self) -> Iterator[None]:
@@ -191,7 +207,8 @@ class Trainer(pl.Trainer):
         except UserError:
             raise
         except Exception as error:
-            if not self._checkpoint_connector._loaded_checkpoint:  # released once restoring is complete
+            # No public attribute shows that a checkpoint is being restored; this one is emptied at the end of restoring.
+            if not self._checkpoint_connector._loaded_checkpoint:
                 raise
             reason = " ".join(f"{type(error).__name__}: {error}".split())[:150]
             raise UserError(
@@ -208,13 +225,34 @@ class Trainer(pl.Trainer):
         adapts = isinstance(model, Adaptation)
         require(adapts, "model.class_path", "a module that adapts a pretrained model", type(model).__name__)
         self.verb = "invert"
-        process_group.check_alone(self, self.verb)
+        self.check_alone(self.verb)
         for name, value in self.unusual.items() if model.learns else ():
-            require(
-                False, f"trainer.{name}", "no such option, as data.steps and model.budget decide how concepts are learned", value
-            )
+            reason = "as data.steps and model.budget decide how concepts are learned"
+            raise UserError(f"trainer.{name}: expected no such option, {reason}, found {value}")
         if model.learns:
             self.fit(model, datamodule=datamodule)
         else:
             require(self.processes == 1, "trainer.processes", f"1 for {model.method}, which learns nothing", self.processes)
         self.test(model, datamodule=datamodule, verbose=False)
+
+
+def _check_options(options: dict[str, Any]) -> None:
+    """Refuse values that Lightning does not check.
+
+    Raises:
+        UserError: with option, range and value.
+    """
+    for least, names in LEAST.items():
+        for name in names:
+            value = options.get(name)
+            value = int(value) if isinstance(value, str) and value.isdecimal() else value  # devices may be a string
+            if isinstance(value, int | float) and not isinstance(value, bool):
+                check_range(f"trainer.{name}", value, least, MOST_DEVICES if name in ("devices", "num_nodes") else math.inf)
+    for name in SHARES:
+        value = options.get(name)
+        if isinstance(value, int | float):
+            whole = f"a whole number of {'steps' if name == 'val_check_interval' else 'batches'}"
+            valid = 0 <= value <= 1 or (value > 1 and value == int(value))
+            require(valid, f"trainer.{name}", f"a share from 0 to 1 or {whole}", value)
+    never = "0; trainer.limit_val_batches 0 validates never"
+    require(options.get("val_check_interval") != 0, "trainer.val_check_interval", "more than 0", never)

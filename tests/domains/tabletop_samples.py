@@ -7,7 +7,7 @@ import torch
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.tabletop.interface import IMAGE, PLACES, POSE, STATE_NAMES, STATE_UNITS
 from ftl_lightning.domains.tabletop.source import Expert
-from ftl_lightning.services.seeding import generator, task_key
+from ftl_lightning.services.randomness import generator, task_key
 
 
 def made_up(self: Expert, task: str, count: int, seed: int, **_: bool) -> Demonstrations:

@@ -14,7 +14,7 @@ from ftl_lightning.domains.driving import expert
 from ftl_lightning.domains.driving.domain import DOMAIN
 from ftl_lightning.domains.driving.traffic import STATE, TRAFFIC, decision_seconds, training_set
 from ftl_lightning.evaluation.closed_loop import PlanFollower
-from ftl_lightning.services.seeding import EVALUATION_SEED
+from ftl_lightning.services.randomness import EVALUATION_SEED
 from tests.conftest import ROOT
 
 TASK = "roundabout third exit"

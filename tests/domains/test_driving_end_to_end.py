@@ -22,7 +22,7 @@ from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.seeding import generator
+from ftl_lightning.services.randomness import generator
 from ftl_lightning.training.data import InversionData
 from ftl_lightning.training.model_config import Prepared, find_view
 from ftl_lightning.training.model_folder import read_model

@@ -31,7 +31,7 @@ from ftl_lightning.domains.tabletop.interface import (
 from ftl_lightning.methods.ftl_igm.pretraining import PretrainingModule
 from ftl_lightning.networks.image_encoder import ImageEncoders
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.seeding import generator
+from ftl_lightning.services.randomness import generator
 from ftl_lightning.training.data import PretrainingData
 from ftl_lightning.training.model_folder import load_model
 from ftl_lightning.training.trainer import Trainer

@@ -9,7 +9,7 @@ from ftl_lightning.data.features import take
 from ftl_lightning.domains.tabletop.interface import HAND, IMAGE, MOVED, ORIGIN, POSE, SHIFT, VIEWS, moved
 from ftl_lightning.domains.tabletop.scenes import BOOK, CIRCLE, TRIANGLE, scene_of
 from ftl_lightning.domains.tabletop.source import initial_states
-from ftl_lightning.services.seeding import generator
+from ftl_lightning.services.randomness import generator
 
 PLACED = {CIRCLE: (0.42, 0.12, 0.0), TRIANGLE: (0.55, -0.10, 0.3), BOOK: (0.57, 0.10, 0.2)}
 

@@ -21,7 +21,7 @@ from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.methods.ftl_igm.model import DiffusionConfig, GenerativeModel
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.seeding import generator
+from ftl_lightning.services.randomness import generator
 from ftl_lightning.training.model_config import Prepared
 
 

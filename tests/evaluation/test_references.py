@@ -18,7 +18,7 @@ from ftl_lightning.evaluation.generation import TaskResult
 from ftl_lightning.evaluation.references import FRESH, REPLAYED, Real, coverage, lines, novelty
 from ftl_lightning.evaluation.results import read_rows
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.seeding import DEMONSTRATION_SEED
+from ftl_lightning.services.randomness import DEMONSTRATION_SEED
 from tests.evaluation.conftest import invert
 
 SCENES = load_domain("object_rearrangement")

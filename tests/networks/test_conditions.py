@@ -21,7 +21,7 @@ from ftl_lightning.networks.conditions import CHOSEN, ENCODERS, EntityEncoder, P
 from ftl_lightning.networks.mlp import MLPDenoiser
 from ftl_lightning.networks.temporal_unet import TemporalUNet
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.seeding import generator
+from ftl_lightning.services.randomness import generator
 from ftl_lightning.training.model_config import Prepared
 
 STEPS = 6

@@ -18,7 +18,7 @@ from ftl_lightning.methods.ftl_igm.pretraining import LossOptions, PretrainingMo
 from ftl_lightning.methods.in_context.pretraining import InContextPretraining
 from ftl_lightning.networks.image_encoder import ImageEncoder, ImageEncoders, SpatialSoftmax
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.seeding import generator
+from ftl_lightning.services.randomness import generator
 from ftl_lightning.training.adaptation import LearnerAdaptation
 from ftl_lightning.training.data import InversionData, OwnData
 from ftl_lightning.training.inversion_module import InversionModule

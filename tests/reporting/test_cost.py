@@ -16,7 +16,7 @@ from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.igm.inversion import invert
 from ftl_lightning.igm.settings import InversionSettings
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
-from ftl_lightning.services.seeding import generator
+from ftl_lightning.services.randomness import generator
 from ftl_lightning.training.data import InversionData
 from ftl_lightning.training.model_folder import read_model
 from tests.conftest import ROOT

@@ -28,7 +28,7 @@ from ftl_lightning.reporting.measurements import (
     write_frontier,
 )
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.seeding import generator
+from ftl_lightning.services.randomness import generator
 from ftl_lightning.training.data import InversionData
 from ftl_lightning.training.model_folder import read_model
 from tests.conftest import ROOT

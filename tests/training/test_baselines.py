@@ -21,7 +21,7 @@ from ftl_lightning.methods.in_context.model import InContextConfig, InContextMod
 from ftl_lightning.methods.in_context.pretraining import InContextPretraining
 from ftl_lightning.methods.language.adaptation import LanguageAdaptation
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.seeding import generator
+from ftl_lightning.services.randomness import generator
 from ftl_lightning.training.adaptation import LearnerAdaptation
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.data import InversionData

@@ -38,7 +38,7 @@ from ftl_lightning.igm.composition import Composition
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.networks.text_encoder import load_encoder
 from ftl_lightning.services.progress import bar
-from ftl_lightning.services.seeding import DEMONSTRATION_SEED, EVALUATION_SEED, generator
+from ftl_lightning.services.randomness import DEMONSTRATION_SEED, EVALUATION_SEED, generator
 from ftl_lightning.services.tensor_file import write_text
 from ftl_lightning.training.concept_model import ConceptModel
 

@@ -21,7 +21,7 @@ from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.methods.in_context.model import InContextModel
 from ftl_lightning.networks.text_encoder import load_encoder
 from ftl_lightning.reporting.paired import episodes
-from ftl_lightning.services.seeding import DEMONSTRATION_SEED
+from ftl_lightning.services.randomness import DEMONSTRATION_SEED
 from ftl_lightning.services.tensor_file import write_text
 
 OURS = "ours"

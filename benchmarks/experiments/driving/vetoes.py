@@ -15,7 +15,7 @@ from ftl_lightning import FewShot
 from ftl_lightning.domains.driving.domain import DOMAIN
 from ftl_lightning.domains.driving.foresight import VETOES
 from ftl_lightning.domains.driving.traffic import BELIEF
-from ftl_lightning.services.seeding import DEMONSTRATION_SEED
+from ftl_lightning.services.randomness import DEMONSTRATION_SEED
 from ftl_lightning.services.tensor_file import write_text
 
 TASK = "roundabout"

@@ -14,10 +14,9 @@ from rich.table import Table
 from ftl_lightning.apps.ablation.plan import Cell
 from ftl_lightning.evaluation.summary import literal
 from ftl_lightning.services.errors import UserError, about, short
-from ftl_lightning.services.printing import line
-from ftl_lightning.services.representation import counted
-from ftl_lightning.services.schema import check_type, read_json
 from ftl_lightning.services.tensor_file import alone, write_text
+from ftl_lightning.services.text import counted, line
+from ftl_lightning.services.validation import check_type, read_json
 
 if TYPE_CHECKING:
     import pandas as pd

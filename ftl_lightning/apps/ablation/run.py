@@ -30,9 +30,9 @@ from ftl_lightning.apps.ablation.record import (
 from ftl_lightning.services import log_folder
 from ftl_lightning.services.configuration import load
 from ftl_lightning.services.errors import UserError, require
-from ftl_lightning.services.printing import say
 from ftl_lightning.services.progress import bar
 from ftl_lightning.services.shipped import pretrained_folder
+from ftl_lightning.services.text import say
 from ftl_lightning.services.trust import check_module
 
 if TYPE_CHECKING:

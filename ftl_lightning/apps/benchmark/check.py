@@ -13,8 +13,8 @@ from ftl_lightning.apps.benchmark.run import SHIPPED, Candidate
 from ftl_lightning.apps.benchmark.submission import FORMAT, GIVEN, KIND, PRETRAINED, Row, Run, Submission, machine, scored
 from ftl_lightning.apps.benchmark.suite import REQUIRED, SEEDS, TRAINING, BenchmarkSuite, load_suite, suite_names
 from ftl_lightning.services.errors import about, require, short
-from ftl_lightning.services.printing import say
 from ftl_lightning.services.tensor_file import content_hash
+from ftl_lightning.services.text import say
 from ftl_lightning.training.method import code_hash, load_method
 from ftl_lightning.version import __version__
 

@@ -20,7 +20,7 @@ from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.comparison import Comparison
 from ftl_lightning.domains.domain import ACCURACY, Concepts, Domain, Generated, Metric, Plans
 from ftl_lightning.domains.tasks import EvaluationTask, Suite, training_suite
-from ftl_lightning.services.seeding import FRESH_SEED
+from ftl_lightning.services.randomness import FRESH_SEED
 
 TEMPLATES, TEMPLATE_SEED = 80, 7_000_000
 """Number of templates per kind, and their reserved seed."""

@@ -7,8 +7,8 @@ from ftl_lightning.apps.benchmark.check import check_submission
 from ftl_lightning.apps.benchmark.submission import GIVEN, Row, Run, Score, Submission, score
 from ftl_lightning.apps.benchmark.suite import BenchmarkSuite, load_suite, suite_names
 from ftl_lightning.services.errors import require
-from ftl_lightning.services.escape import markdown
 from ftl_lightning.services.tensor_file import visible
+from ftl_lightning.services.text import markdown
 
 BEGIN, END = "<!-- leaderboard: begin -->\n", "<!-- leaderboard: end -->\n"
 HEAD = """# Leaderboard

@@ -16,10 +16,10 @@ from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.evaluation.row import METHOD, REFERENCE
 from ftl_lightning.services.configuration import load
 from ftl_lightning.services.errors import UserError, about, require, short
-from ftl_lightning.services.printing import say
 from ftl_lightning.services.progress import bar
 from ftl_lightning.services.shipped import pretrained_folder, shipped
 from ftl_lightning.services.tensor_file import write_text
+from ftl_lightning.services.text import say
 from ftl_lightning.training.method import Method, class_path, load_method
 from ftl_lightning.training.model_config import CONFIG
 

@@ -12,7 +12,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from ftl_lightning.services.seeding import task_key
+from ftl_lightning.services.randomness import task_key
 
 STEPS = 40
 """Number of points of a stroke."""

@@ -10,9 +10,9 @@ from pathlib import Path
 
 from ftl_lightning.apps.benchmark.suite import BenchmarkSuite, load_suite
 from ftl_lightning.services.errors import about
-from ftl_lightning.services.limits import check_readable
-from ftl_lightning.services.schema import from_mapping, read_json
+from ftl_lightning.services.files import check_readable
 from ftl_lightning.services.tensor_file import content_hash, write_text
+from ftl_lightning.services.validation import from_mapping, read_json
 from ftl_lightning.version import __version__
 
 KIND, FORMAT = "few-shot concepts", 1

@@ -13,9 +13,9 @@ from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.domains.domain import Domain, Recoveries
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.services.errors import UserError, about, require, short
-from ftl_lightning.services.schema import from_mapping, read_json
-from ftl_lightning.services.seeding import DEMONSTRATION_SEED, EVALUATION_SEED
+from ftl_lightning.services.randomness import DEMONSTRATION_SEED, EVALUATION_SEED
 from ftl_lightning.services.tensor_file import bytes_hash, file_hash, write_text
+from ftl_lightning.services.validation import from_mapping, read_json
 from ftl_lightning.version import __version__
 
 FOLDER = Path(__file__).parent / "suites"

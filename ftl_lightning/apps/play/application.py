@@ -18,7 +18,7 @@ from ftl_lightning.apps.play.page import POLICY, page
 from ftl_lightning.apps.play.server import body_of, message_of
 from ftl_lightning.apps.play.workspace import Stopped, Workspace, title_of
 from ftl_lightning.services.errors import require, short
-from ftl_lightning.services.schema import from_mapping, parse_json
+from ftl_lightning.services.validation import from_mapping, parse_json
 
 MOST_BODY, MOST_FILE = 4 * 2**20, 64 * 2**20
 """Maximum bytes of a request, and of an uploaded file."""

@@ -22,10 +22,9 @@ from ftl_lightning.domains.registry import domain_names, load_domain
 from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.igm.concept import KIND, Concept
 from ftl_lightning.services.errors import about, require, short
-from ftl_lightning.services.limits import check_readable
-from ftl_lightning.services.shipped import MODELS
+from ftl_lightning.services.files import check_readable
+from ftl_lightning.services.shipped import FILM, MODELS
 from ftl_lightning.services.tensor_file import bytes_hash, kind_of, visible, write_text
-from ftl_lightning.services.web import FILM
 from ftl_lightning.training.model_folder import find_model
 
 HERE = Path(__file__).parent

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from ftl_lightning.services.errors import require
-from ftl_lightning.services.ranges import check_count, check_factor, check_range
+from ftl_lightning.services.validation import check_count, check_factor, check_range
 
 MOST_SAMPLES, MOST_DRAWN, MOST_PARTS, MOST_NAME = 64, 20, 12, 100
 """Maximum number of samples and of drawn demonstrations per request, of concepts in a mixture, and of letters in a name."""

@@ -22,7 +22,7 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from ftl_lightning.services.errors import UserError, mistake_of_machine, short
-from ftl_lightning.services.printing import line, say
+from ftl_lightning.services.text import line, say
 
 LOOPBACK = "127.0.0.1"
 PORT = 8765

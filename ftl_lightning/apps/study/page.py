@@ -16,10 +16,9 @@ from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.films import ABOVE, Wireframe, seen, window
 from ftl_lightning.evaluation.pictures import frame_milliseconds, gif
 from ftl_lightning.services.errors import UserError, require, short
-from ftl_lightning.services.escape import script_json
-from ftl_lightning.services.printing import line, plain
-from ftl_lightning.services.schema import read_json
 from ftl_lightning.services.tensor_file import bytes_hash, content_hash, write_text
+from ftl_lightning.services.text import line, plain, script_json
+from ftl_lightning.services.validation import read_json
 
 PAGE, KEY = "study.html", "key.json"
 KEY_KIND, FORMAT = "study key", 1

@@ -15,9 +15,9 @@ from torch import Tensor
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.services.errors import about, require, short, shown
-from ftl_lightning.services.printing import line
-from ftl_lightning.services.schema import from_mapping, read_json
 from ftl_lightning.services.tensor_file import file_hash, visible
+from ftl_lightning.services.text import line
+from ftl_lightning.services.validation import from_mapping, read_json
 
 LISTING = "films.json"
 TRAINING, NEW = "training", "new"

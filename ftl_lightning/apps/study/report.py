@@ -16,8 +16,8 @@ from ftl_lightning.apps.study.page import FORMAT, KEY_KIND
 from ftl_lightning.apps.study.questions import BEST, CHECK, DEPICTS, NEW, NO, REPEAT, TRAINING, YES
 from ftl_lightning.evaluation.summary import literal
 from ftl_lightning.services.errors import UserError, about, require, short, shown
-from ftl_lightning.services.printing import line
-from ftl_lightning.services.schema import from_mapping, read_json
+from ftl_lightning.services.text import line
+from ftl_lightning.services.validation import from_mapping, read_json
 
 ANSWERS_KIND = "study answers"
 REPEATS_THAT_MAY_DIFFER = 0.5

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ftl_lightning.data.demonstrations import Contents, Demonstrations, padded
 from ftl_lightning.services.errors import require, short
-from ftl_lightning.services.limits import VARIABLE, most_bytes
+from ftl_lightning.services.files import VARIABLE, most_bytes
 
 
 @dataclass(frozen=True)

@@ -17,10 +17,10 @@ from torch import Tensor
 
 from ftl_lightning.data.demonstrations import FORMATS, KIND, OBSERVED, Contents, Demonstrations, Format
 from ftl_lightning.services.errors import UserError, about, require, short
-from ftl_lightning.services.limits import MOST_TENSORS, check_readable, check_unpacked
+from ftl_lightning.services.files import MOST_TENSORS, check_readable, check_unpacked
 from ftl_lightning.services.progress import bar
-from ftl_lightning.services.schema import check_type
 from ftl_lightning.services.tensor_file import atomic, cache_folder, content_hash, load_tensors, save_tensors
+from ftl_lightning.services.validation import check_type
 
 VERSION = 4
 """Version of the safetensors format. Images are compressed (zlib) to 1-D uint8; the header has their shapes by key as

@@ -23,14 +23,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ftl_lightning.data.demonstrations import FORMATS, Contents, Demonstrations, Format
-from ftl_lightning.data.formats.episodes import Episode, Metadata, check_names, from_episodes, measured, metadata, to_episodes
-from ftl_lightning.services.data_names import INFO
+from ftl_lightning.data.formats.episodes import (
+    Episode,
+    Metadata,
+    check_names,
+    from_episodes,
+    measured,
+    metadata,
+    to_episodes,
+)
 from ftl_lightning.services.errors import UserError, about, require, short, shown
-from ftl_lightning.services.extras import check_extra
-from ftl_lightning.services.limits import read_text
-from ftl_lightning.services.printing import line, say
-from ftl_lightning.services.schema import check_type, from_mapping, parse_json, read_json
-from ftl_lightning.services.targets import check_new_folder
+from ftl_lightning.services.files import INFO, check_new_folder, read_text
+from ftl_lightning.services.shipped import check_extra
+from ftl_lightning.services.text import line, say
+from ftl_lightning.services.validation import check_type, from_mapping, parse_json, read_json
 
 VERSIONS = ("v2.0", "v2.1", "v3.0")
 """Versions that are read; the last is written."""

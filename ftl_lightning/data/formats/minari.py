@@ -17,10 +17,19 @@ from typing import Any
 import numpy as np
 
 from ftl_lightning.data.demonstrations import FORMATS, Contents, Demonstrations, Format
-from ftl_lightning.data.formats.episodes import Episode, Metadata, check_names, from_episodes, measured, metadata, to_episodes
+from ftl_lightning.data.formats.episodes import (
+    Episode,
+    Metadata,
+    check_names,
+    from_episodes,
+    measured,
+    metadata,
+    to_episodes,
+)
+from ftl_lightning.data.recording import PART, feature_parts, states_part
 from ftl_lightning.services.errors import UserError, about, require, short
-from ftl_lightning.services.extras import check_extra
-from ftl_lightning.services.schema import from_mapping
+from ftl_lightning.services.shipped import check_extra
+from ftl_lightning.services.validation import from_mapping
 
 CONCEPT = "concept"
 """Key of an episode's text, see this module."""
@@ -53,8 +62,6 @@ def read_contents(name: str, part: str = "", observed: Sequence[str] | None = No
     """Read the attributes of demonstrations without validating them. Arguments and errors as in :func:`read_minari`."""
     check_extra("minari", f"{name}: expected a file, found none; a Minari data set of this name")
     import minari
-
-    from ftl_lightning.data.recording import PART, feature_parts, states_part
 
     try:
         dataset = minari.load_dataset(name)
@@ -119,8 +126,6 @@ def write_minari(demonstrations: Demonstrations, name: str) -> None:
     import minari
     from gymnasium.spaces import Box
     from minari.data_collector import EpisodeBuffer
-
-    from ftl_lightning.data.recording import PART
 
     enough = int(demonstrations.lengths.min()) >= 2
     require(enough, name, "demonstrations of two states or more", "one of 1, which makes no step")

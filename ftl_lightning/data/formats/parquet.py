@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from ftl_lightning.services.errors import UserError, about, require, short
-from ftl_lightning.services.limits import MOST_TENSORS, MOST_TEXT, check_readable, check_unpacked
+from ftl_lightning.services.files import MOST_TENSORS, MOST_TEXT, check_readable, check_unpacked
 from ftl_lightning.services.tensor_file import visible
 
 _DAMAGED = (pa.ArrowException, OSError, ValueError, TypeError, KeyError, IndexError, OverflowError, MemoryError)

@@ -26,7 +26,7 @@ from ftl_lightning.domains.agent.scenes import (
 )
 from ftl_lightning.domains.agent.tasks import TRAINING_CONCEPTS
 from ftl_lightning.domains.domain import Split
-from ftl_lightning.services.seeding import VALIDATION_SEED
+from ftl_lightning.services.randomness import VALIDATION_SEED
 
 if TYPE_CHECKING:
     from ftl_lightning.domains.agent.environment import AgentEnvironment

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from ftl_lightning.data.features import Feature
 from ftl_lightning.services.errors import UserError, require
-from ftl_lightning.services.extras import check_extra
-from ftl_lightning.services.seeding import task_key
+from ftl_lightning.services.randomness import task_key
+from ftl_lightning.services.shipped import check_extra
 
 COLOURS = {"red": (255, 87, 34), "yellow": (217, 191, 119), "purple": (149, 56, 158), "green": (148, 252, 19)}
 """RGB colours of the paper, 0 to 255."""

@@ -43,7 +43,7 @@ from ftl_lightning.domains.driving.traffic import (
 from ftl_lightning.domains.driving.views import VIEWS, drive, turned
 from ftl_lightning.domains.execution import ClosedLoop, Policy, Rollout
 from ftl_lightning.domains.pictures import Show
-from ftl_lightning.services.seeding import generator
+from ftl_lightning.services.randomness import generator
 
 if TYPE_CHECKING:
     from highway_env.envs.common.abstract import AbstractEnv

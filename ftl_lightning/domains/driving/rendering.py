@@ -16,7 +16,7 @@ from ftl_lightning.data.features import InitialStates, check_starts, take
 from ftl_lightning.domains.driving.traffic import NAMES, SCENARIO, TRAFFIC, VEHICLES, check_simulator, decision_seconds
 from ftl_lightning.domains.execution import Rollout
 from ftl_lightning.domains.films import Shape, VectorFilm, still
-from ftl_lightning.services.escape import figure_text
+from ftl_lightning.services.text import figure_text
 
 MAX_COLUMNS, MAX_PANELS = 4, 8
 BETWEEN = 4

@@ -13,7 +13,7 @@ from ftl_lightning.domains.comparison import OURS, Published
 from ftl_lightning.domains.domain import Split
 from ftl_lightning.domains.tasks import EvaluationTask, Suite, training_suite
 from ftl_lightning.services.errors import require
-from ftl_lightning.services.extras import check_extra
+from ftl_lightning.services.shipped import check_extra
 
 NAME = "driving"
 HORIZON = 8

@@ -15,7 +15,7 @@ from ftl_lightning.domains.driving.traffic import (
     VEHICLES,
     decision_seconds,
 )
-from ftl_lightning.services.processes import drawn
+from ftl_lightning.services.randomness import drawn
 
 
 def turned(pairs: Tensor, cos: Tensor, sin: Tensor) -> Tensor:

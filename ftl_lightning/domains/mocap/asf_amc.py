@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ftl_lightning.services.errors import UserError, require
-from ftl_lightning.services.limits import most_bytes, read_text
+from ftl_lightning.services.files import most_bytes, read_text
 
 INCH = 0.0254
 """Metres. Lengths in the database are inches after division by ``length`` in the skeleton's ``units``."""

@@ -17,7 +17,7 @@ from ftl_lightning.domains.mocap import skeleton
 from ftl_lightning.domains.mocap.asf_amc import INCH, THORAX, Skeleton
 from ftl_lightning.domains.mocap.skeleton import FPS, as_joints, standing_poses
 from ftl_lightning.services.errors import UserError, require, short
-from ftl_lightning.services.limits import read_text
+from ftl_lightning.services.files import read_text
 
 Numbers = NDArray[np.float64]
 END = "EndSite"

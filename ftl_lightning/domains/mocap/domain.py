@@ -28,7 +28,7 @@ from ftl_lightning.domains.mocap.source import Recorded
 from ftl_lightning.domains.mocap.tasks import NEW_CONCEPTS, SUITES, TESTED, TRAINING_CONCEPTS, action, judged
 from ftl_lightning.domains.pictures import Show
 from ftl_lightning.domains.tasks import training_suite
-from ftl_lightning.services.processes import drawn
+from ftl_lightning.services.randomness import drawn
 
 SHORTEST = 1e-3
 """Minimum length in metres of a generated bone with a direction; shorter bones are not changed."""

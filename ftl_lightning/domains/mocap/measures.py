@@ -34,7 +34,7 @@ from ftl_lightning.domains.mocap.skeleton import (
     bone_lengths,
 )
 from ftl_lightning.services.errors import require
-from ftl_lightning.services.extras import check_extra
+from ftl_lightning.services.shipped import check_extra
 
 STRIDE = 0.3
 """Minimum ankle distance in metres of a stride; closer ankles are a level pose."""

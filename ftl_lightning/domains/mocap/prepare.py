@@ -32,10 +32,10 @@ from ftl_lightning.domains.mocap.source import (
 )
 from ftl_lightning.domains.mocap.tasks import HELD_OUT, SEGMENTS, TRAINING_CONCEPTS, cleaned, read_segments
 from ftl_lightning.services.errors import UserError, require, short
-from ftl_lightning.services.limits import MOST_TEXT, check_readable
+from ftl_lightning.services.files import MOST_TEXT, check_readable
 from ftl_lightning.services.progress import bar
-from ftl_lightning.services.representation import counted
 from ftl_lightning.services.tensor_file import write_text
+from ftl_lightning.services.text import counted
 
 REPORT = "recordings.json"
 LEFT_OUT = "left out of pretraining"

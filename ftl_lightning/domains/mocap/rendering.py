@@ -13,7 +13,7 @@ from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.films import Points, Wireframe, drawn, seen
 from ftl_lightning.domains.mocap import skeleton
 from ftl_lightning.domains.mocap.skeleton import BONES, FPS, HIPS, SHOULDERS, as_joints
-from ftl_lightning.services.escape import figure_text
+from ftl_lightning.services.text import figure_text
 
 LEFT, RIGHT, TRUNK = "#0a6fb5", "#d9591c", "#3b3f45"
 """Colours of the person's left and right limbs and of the trunk; safe for colour blindness."""

@@ -47,8 +47,8 @@ from ftl_lightning.domains.mocap.tasks import (
     read_segments,
 )
 from ftl_lightning.services.errors import UserError, require, short
-from ftl_lightning.services.limits import check_readable
-from ftl_lightning.services.seeding import generator, task_key
+from ftl_lightning.services.files import check_readable
+from ftl_lightning.services.randomness import generator, task_key
 from ftl_lightning.services.tensor_file import atomic
 
 FILE = "recordings.npz"

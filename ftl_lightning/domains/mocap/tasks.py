@@ -12,7 +12,7 @@ from pathlib import Path
 
 from ftl_lightning.domains.tasks import EvaluationTask, Suite
 from ftl_lightning.services.errors import UserError, require
-from ftl_lightning.services.limits import read_text
+from ftl_lightning.services.files import read_text
 
 HELD_OUT = ("13_29", "13_30", "13_31", "14_14", "14_20", "79_01", "80_71", "126_03", "126_04", "126_05")
 """Trials excluded from pretraining as a whole, since they show a new concept."""

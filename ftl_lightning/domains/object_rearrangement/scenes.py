@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.seeding import task_key
+from ftl_lightning.services.randomness import task_key
 
 SHAPES = ("circle", "triangle", "square")
 EXTENT = 5.0

@@ -17,8 +17,8 @@ from ftl_lightning.domains.domain import View
 from ftl_lightning.domains.execution import Simulator, pybullet
 from ftl_lightning.domains.tasks import EvaluationTask, Suite, training_suite
 from ftl_lightning.services.errors import require
-from ftl_lightning.services.extras import check_extra
-from ftl_lightning.services.processes import drawn
+from ftl_lightning.services.randomness import drawn
+from ftl_lightning.services.shipped import check_extra
 
 
 @dataclass(frozen=True)

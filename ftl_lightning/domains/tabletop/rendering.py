@@ -15,7 +15,7 @@ from ftl_lightning.domains.films import Shape, VectorFilm, some, still
 from ftl_lightning.domains.tabletop.interface import FRONT, HERTZ, POSE, THRESHOLD, check_simulator
 from ftl_lightning.domains.tabletop.scenes import BOOK, CIRCLE, COLUMNS, HEIGHT, OBJECTS, SIGHT, WHITE, outline, outlines, support
 from ftl_lightning.domains.tabletop.world import ARM, COLOUR, FINGERS, TABLE_COLOUR
-from ftl_lightning.services.escape import figure_text
+from ftl_lightning.services.text import figure_text
 
 MAX_COLUMNS = 4
 FRAMES = 60

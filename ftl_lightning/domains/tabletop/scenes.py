@@ -29,7 +29,7 @@ from ftl_lightning.domains.tabletop.interface import (
     check_task,
 )
 from ftl_lightning.services.errors import UserError, require
-from ftl_lightning.services.seeding import task_key
+from ftl_lightning.services.randomness import task_key
 
 CIRCLE, TRIANGLE, BOOK, WHITE, BOWL = OBJECTS = ("green circle", "orange triangle", "book", "white surface", "purple bowl")
 COLUMNS = {name: slice(4 * number, 4 * number + 4) for number, name in enumerate(OBJECTS)}

@@ -37,7 +37,7 @@ from ftl_lightning.domains.tabletop.interface import (
 from ftl_lightning.domains.tabletop.scenes import HEIGHT, HIDDEN, NEEDED, PRESENT, SURFACES, draw_scene, free_pose, outline, scenes
 from ftl_lightning.domains.tabletop.world import turned
 from ftl_lightning.services.errors import require
-from ftl_lightning.services.seeding import VALIDATION_SEED, task_key
+from ftl_lightning.services.randomness import VALIDATION_SEED, task_key
 
 _LOG = logging.getLogger(__name__)
 

@@ -14,7 +14,7 @@ from ftl_lightning.igm.inversion import Tell, invert
 from ftl_lightning.igm.model import Draws, Invertible
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.igm.settings import PAPER, InversionSettings
-from ftl_lightning.services.seeding import generator
+from ftl_lightning.services.randomness import generator
 
 MOST = 12
 """Maximum number of demonstrations; several concepts are learned for each."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from ftl_lightning.services.representation import Shown, counted
+from ftl_lightning.services.text import Shown, counted
 
 STRETCH = 1.5
 """Default factor by which mixtures are moved away from the modes' mean: convex combinations vary less than the modes."""

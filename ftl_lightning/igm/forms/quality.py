@@ -13,7 +13,7 @@ from ftl_lightning.data.features import InitialStates, moved
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.igm.model import Invertible
 from ftl_lightning.igm.samplers import Sampling
-from ftl_lightning.services.seeding import generator, task_key
+from ftl_lightning.services.randomness import generator, task_key
 
 COPIES, COLLAPSED, ROUGH = 0.2, 0.5, 1.5
 """Thresholds: minimum novelty, minimum spread, maximum roughness."""

@@ -11,7 +11,7 @@ from ftl_lightning.igm.composition import Composition, batched
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.methods.bases import AdditiveModel, StepConfig, added, unroll
 from ftl_lightning.methods.bc import METHOD
-from ftl_lightning.services.ranges import check_range
+from ftl_lightning.services.validation import check_range
 from ftl_lightning.training.concept_model import TextConceptModel
 from ftl_lightning.training.model_config import Prepared
 

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from ftl_lightning.methods.bases import check_window
 from ftl_lightning.methods.bc.model import CloningConfig, CloningModel
-from ftl_lightning.services.ranges import check_range
+from ftl_lightning.services.validation import check_range
 from ftl_lightning.training.data import Batch, PretrainingData
 from ftl_lightning.training.model_config import ModelConfig, Prepared
 from ftl_lightning.training.pretraining import Pretraining

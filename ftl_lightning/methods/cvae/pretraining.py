@@ -7,8 +7,8 @@ from torch import Tensor
 
 from ftl_lightning.data.features import moved
 from ftl_lightning.methods.cvae.model import VAEConfig, VAEModel
-from ftl_lightning.services.processes import drawn
-from ftl_lightning.services.ranges import check_range
+from ftl_lightning.services.randomness import drawn
+from ftl_lightning.services.validation import check_range
 from ftl_lightning.training.data import Batch, PretrainingData
 from ftl_lightning.training.model_config import ModelConfig, Prepared
 from ftl_lightning.training.pretraining import Pretraining, check_shown

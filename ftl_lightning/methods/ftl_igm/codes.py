@@ -7,9 +7,8 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.igm.diffusion import MOST_STEPS
-from ftl_lightning.services.processes import drawn, mean
-from ftl_lightning.services.ranges import check_count, check_range
-from ftl_lightning.services.seeding import generator
+from ftl_lightning.services.randomness import drawn, generator, mean
+from ftl_lightning.services.validation import check_count, check_range
 
 
 @dataclass(frozen=True)

@@ -16,9 +16,8 @@ from ftl_lightning.igm.model import DiffusionModel, Draws
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.methods.ftl_igm import METHOD
 from ftl_lightning.services.errors import require, short
-from ftl_lightning.services.ranges import check_range
-from ftl_lightning.services.schema import from_mapping
 from ftl_lightning.services.spectrum import Spectrum
+from ftl_lightning.services.validation import check_range, from_mapping
 from ftl_lightning.training.concept_model import TextConceptModel
 from ftl_lightning.training.model_config import ModelConfig, Prepared
 

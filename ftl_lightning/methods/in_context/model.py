@@ -15,7 +15,7 @@ from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.methods.bases import StepConfig, unroll
 from ftl_lightning.methods.in_context import METHOD
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.ranges import LARGEST, check_range
+from ftl_lightning.services.validation import LARGEST, check_range
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.model_config import Prepared
 

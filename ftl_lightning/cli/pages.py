@@ -1,13 +1,16 @@
-"""The verbs ``play`` and ``view``. Imports are local, so that the program starts at once."""
+"""Verbs for pages: ``play``, ``view``, ``study``, ``study-report``. Imports are local, for a fast start."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ftl_lightning.services.ranges import check_range
+from ftl_lightning.services.errors import require
+from ftl_lightning.services.text import say
+from ftl_lightning.services.validation import check_count, check_range
 
 if TYPE_CHECKING:
     from ftl_lightning.apps.play.workspace import Workspace
+
 
 LARGEST_PORT = 65_535
 
@@ -39,19 +42,15 @@ class PlayOptions:
     browser: bool = True
 
     def __post_init__(self) -> None:
-        from ftl_lightning.services.errors import UserError
-
         check_range("port", self.port, 0, LARGEST_PORT)
-        if self.pairs and not self.static:
-            raise UserError("pairs: expected --static FOLDER beside it, found none")
-        if bad := [pair for pair in self.pairs if len(pair.split(" + ")) != 2]:
-            raise UserError(f"pairs: expected two concepts each, such as 'walk + run', found {bad[0]!r}")
+        require(self.static or not self.pairs, "pairs", "--static FOLDER beside it", "none")
+        for pair in self.pairs:
+            require(pair.count(" + ") == 1, "pairs", "two concepts each, such as 'walk + run'", repr(pair))
 
 
 def play(options: PlayOptions) -> None:
-    """Serve the page until Ctrl-C."""
-    from ftl_lightning.services.extras import check_extra
-    from ftl_lightning.services.shipped import shipped_models
+    """Serve the page of ``options`` until Ctrl-C, or write it to a file."""
+    from ftl_lightning.services.shipped import check_extra, shipped_models
 
     check_extra("play", "play: its server")
     from ftl_lightning.apps.play.application import Desk, playing
@@ -79,7 +78,6 @@ def play(options: PlayOptions) -> None:
 def _write_static(workspace: "Workspace", path: Path, pairs: "list[tuple[str, str]]") -> None:
     from ftl_lightning.apps.play.page import PAIRS, WEIGHTS, write_offline
     from ftl_lightning.apps.play.requests import Learn
-    from ftl_lightning.services.printing import say
     from ftl_lightning.services.progress import bar
 
     if workspace.work()["demonstrations"]:
@@ -113,8 +111,8 @@ class ViewOptions:
 
 
 def view(options: ViewOptions) -> None:
-    """Serve the page until Ctrl-C."""
-    from ftl_lightning.services.extras import check_extra
+    """Serve the page of ``options`` until Ctrl-C."""
+    from ftl_lightning.services.shipped import check_extra
 
     check_extra("play", "view: its server")
     from ftl_lightning.apps.play.application import reading, viewing
@@ -124,3 +122,75 @@ def view(options: ViewOptions) -> None:
     results = holds_results(options.file)
     routes = reading(results_page(options.file)) if results else viewing(viewed(options.file, options.pretrained))
     serve(routes, Place(options.host, options.port, options.browser))
+
+
+@dataclass(frozen=True)
+class StudyOptions:
+    """Make a web page in which people rate films of generated behaviour.
+
+    Attributes:
+        domain: name of a domain with filmed plans.
+        films: folder with files METHOD/CONCEPT.safetensors of "sample --out", or with films.json, a list of
+            {"concept", "method", "file"} and optionally "scenario", "setting" and "row".
+        out: folder for study.html, for the raters, and key.json, which stays with you.
+        scenarios: number of scenarios for each concept, drawn from the samples in all methods' files.
+        repeats: attention checks: number of questions that are asked twice.
+        still: attention checks: number of films without motion.
+        seed: seed of the films' numbers and of the shown and repeated films.
+        title: title of the page; empty for a neutral title.
+        consent: text file that raters agree to, in place of the default text.
+    """
+
+    domain: str
+    films: str = "films"
+    out: str = "study"
+    scenarios: int = 1
+    repeats: int = 2
+    still: int = 1
+    seed: int = 0
+    title: str = ""
+    consent: str = ""
+
+    def __post_init__(self) -> None:
+        check_range("seed", self.seed, 0)
+        for name, least in (("scenarios", 1), ("repeats", 0), ("still", 0)):
+            check_count(name, getattr(self, name), least)
+
+
+def study(options: StudyOptions) -> None:
+    """Make the page and its key from ``options``."""
+    from ftl_lightning.apps.study.page import make_study
+    from ftl_lightning.apps.study.questions import ask, read_films
+    from ftl_lightning.domains.registry import load_domain
+    from ftl_lightning.services.files import read_text
+
+    words = read_text(options.consent, "text") if options.consent else ""
+    domain = load_domain(options.domain)
+    films = read_films(Path(options.films), domain, options.scenarios, options.seed)
+    made = make_study(domain, ask(films, options.repeats, options.still, options.seed), Path(options.out), options.title, words)
+    say(f"{made.page}: {made.films} films, {made.questions} questions, {made.size / 1000:.0f} kB; it goes to the raters")
+    say(f"{made.key}: says which film is whose; it stays with you")
+
+
+def study_report(answers: list[str] = [], key: str = "", all_raters: bool = False) -> None:  # noqa: B006 (never changed)
+    """Print the table of a study's answers: study-report study/answers*.json.
+
+    Args:
+        answers: files saved by raters, or folders of files answers*.json.
+        key: the study's key; empty for key.json beside the first file.
+        all_raters: also count raters who failed attention checks.
+
+    Raises:
+        UserError: without files, or for a file that is not a rater's.
+    """
+    from ftl_lightning.apps.study.report import NOTES, study_table
+    from ftl_lightning.evaluation.summary import show
+
+    require(answers, "answers", "files that raters saved", "none; run: study-report study/answers*.json")
+    first = Path(answers[0])
+    beside = (first if first.is_dir() else first.parent) / "key.json"
+    result = study_table([Path(name) for name in answers], Path(key) if key else beside, all_raters)
+    for refusal in (*(f"refused: {refusal}" for refusal in result.refused), *result.dropped):
+        say(refusal, error=True)
+    show(result.table())
+    say("\n".join(NOTES))

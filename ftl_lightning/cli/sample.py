@@ -4,8 +4,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from ftl_lightning.services.printing import say
-from ftl_lightning.services.ranges import check_count, check_range
+from ftl_lightning.services.errors import require
+from ftl_lightning.services.text import say
+from ftl_lightning.services.validation import check_count, check_range
 
 if TYPE_CHECKING:
     from ftl_lightning.data.features import InitialStates
@@ -64,11 +65,9 @@ class SampleOptions:
     settings: str = ""
 
     def __post_init__(self) -> None:
-        from ftl_lightning.services.errors import UserError
-
         for name, path, endings in (("animation", self.animation, (".gif",)), ("figure", self.figure, (".png", ".svg", ".pdf"))):
-            if path and Path(path).suffix not in endings:
-                raise UserError(f"{name}: expected a name that ends in {' or '.join(endings)}, found {path!r}")
+            valid = not path or Path(path).suffix in endings
+            require(valid, name, f"a name that ends in {' or '.join(endings)}", repr(path))
         check_range("seed", self.seed, 0)
         check_count("count", self.count, 1, MOST_DRAWN if self.figure else MOST_SAMPLES)
         check_count("steps", self.steps, 0)
@@ -76,7 +75,7 @@ class SampleOptions:
 
 
 def sample(options: SampleOptions) -> None:
-    """Generate behaviour; write, judge, draw and execute it."""
+    """Generate behaviour as in ``options``; write, judge, draw and execute it."""
     from dataclasses import replace
 
     from ftl_lightning.evaluation.pictures import captioned, gif
@@ -129,26 +128,24 @@ def _sampling(options: SampleOptions) -> dict[str, Any]:
 
 def _check_sample(options: SampleOptions, domain: "Domain") -> None:
     """Refuse options that the domain does not support, before sampling."""
-    from ftl_lightning.services.errors import UserError
-
     if options.goal:
         domain.check_goal(options.goal)
-    if options.animation and options.execute and domain.closed_loop and domain.closed_loop.film is None:
-        raise UserError(f"animation: expected a domain that films episodes, found {domain.name}")
-    if options.export and Path(options.export).suffix not in domain.show.exports:
+    if options.animation and options.execute and domain.closed_loop:
+        require(domain.closed_loop.film, "animation", "a domain that films episodes", domain.name)
+    if options.export:
         known = " or ".join(domain.show.exports)
-        message = f"a name that ends in {known}" if known else f"none, as nothing else reads plans of {domain.name}"
-        raise UserError(f"export: expected {message}, found {options.export!r}")
-    if options.execute and domain.closed_loop is None:
-        raise UserError(f"execute: expected a domain with an environment, found {domain.name}, which has none")
+        expected = f"a name that ends in {known}" if known else f"none, as nothing else reads plans of {domain.name}"
+        require(Path(options.export).suffix in domain.show.exports, "export", expected, repr(options.export))
+    if options.execute:
+        require(domain.closed_loop, "execute", "a domain with an environment", f"{domain.name}, which has none")
     if options.execute and domain.closed_loop is not None:
         domain.closed_loop.expect()
-    if options.animation and not options.execute and domain.show.film is None:
-        raise UserError(f"animation: expected --execute true (plans of {domain.name} are not filmed), found {options.animation!r}")
-    if domain.observed and not (options.initial or _start_task(options, domain)):
-        raise UserError(
-            f"goal, initial: expected a task or a demonstrations file to start from (domain {domain.name}), found neither"
-        )
+    if options.animation and not options.execute:
+        expected = f"--execute true (plans of {domain.name} are not filmed)"
+        require(domain.show.film, "animation", expected, repr(options.animation))
+    if domain.observed:
+        expected = f"a task or a demonstrations file to start from (domain {domain.name})"
+        require(options.initial or _start_task(options, domain), "goal, initial", expected, "neither")
 
 
 def _export_files(export: str, count: int) -> list[Path]:
@@ -157,7 +154,7 @@ def _export_files(export: str, count: int) -> list[Path]:
     Raises:
         UserError: before sampling, if an existing path is not a file.
     """
-    from ftl_lightning.services.targets import check_file
+    from ftl_lightning.services.files import check_file
 
     if not export:
         return []

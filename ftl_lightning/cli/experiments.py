@@ -1,12 +1,14 @@
-"""The verb ``benchmark`` and its options. Imports are deferred for a fast start."""
+"""Verbs for experiments: ``benchmark``, ``ablate``, ``report``. Imports are local, for a fast start."""
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
-from ftl_lightning.services.errors import UserError, short
-from ftl_lightning.services.printing import line, say
+from ftl_lightning.apps.ablation import Stage
+from ftl_lightning.services.errors import UserError, require, short
+from ftl_lightning.services.text import line, say
+from ftl_lightning.services.validation import check_count
 
 if TYPE_CHECKING:
     from ftl_lightning.apps.benchmark.run import Candidate
@@ -56,16 +58,14 @@ class BenchmarkOptions:
     format: str = "npz"
 
     def __post_init__(self) -> None:
-        if not 0 <= self.recompute <= 1:
-            raise UserError(f"recompute: expected a share from 0 to 1, found {self.recompute}")
-        if given := [f"--{name}" for name in ("list", "check", "leaderboard", "data") if getattr(self, name)][1:]:
-            raise UserError(
-                f"benchmark: expected one of --list, --check, --leaderboard and --data, found {given[0]} beside another"
-            )
-        if not re.fullmatch(r"\d{1,9}(,\d{1,9})*", self.seeds) or len(set(self.seeds.split(","))) <= self.seeds.count(","):
-            raise UserError(
-                f"seeds: expected different numbers with commas between them, such as 0,1,2, found {short(self.seeds)!r}"
-            )
+        require(0 <= self.recompute <= 1, "recompute", "a share from 0 to 1", self.recompute)
+        modes = {"list": self.list, "check": self.check, "leaderboard": self.leaderboard, "data": self.data}
+        given = [f"--{name}" for name, value in modes.items() if value]
+        expected = "one of --list, --check, --leaderboard and --data"
+        require(len(given) < 2, "benchmark", expected, f"{''.join(given[1:2])} beside another")
+        different = len(set(self.seeds.split(","))) > self.seeds.count(",")
+        valid = different and re.fullmatch(r"\d{1,9}(,\d{1,9})*", self.seeds)
+        require(valid, "seeds", "different numbers with commas between them, such as 0,1,2", repr(short(self.seeds)))
 
 
 def _numbers(options: BenchmarkOptions) -> list[int]:
@@ -85,7 +85,7 @@ def _entry(options: BenchmarkOptions, work: Path) -> "Candidate":
 
 
 def benchmark(options: BenchmarkOptions) -> None:
-    """Run the verb."""
+    """Run a method, or list, check, rank or write what the ``options`` ask for instead."""
     if options.list:
         from ftl_lightning.apps.benchmark.leaderboard import suite_table
 
@@ -94,8 +94,8 @@ def benchmark(options: BenchmarkOptions) -> None:
         _check(options)
     elif options.leaderboard:
         from ftl_lightning.apps.benchmark.leaderboard import leaderboard, read_submissions
-        from ftl_lightning.services.representation import counted
         from ftl_lightning.services.tensor_file import write_text
+        from ftl_lightning.services.text import counted
 
         submissions = read_submissions(Path(options.submissions))
         write_text(Path(options.leaderboard), leaderboard(submissions))
@@ -106,12 +106,10 @@ def benchmark(options: BenchmarkOptions) -> None:
         for name in _chosen(options):
             written = write_data(load_suite(name), _numbers(options), Path(options.data), options.format, _root(options))
             say(f"{Path(options.data) / name}: {len(written)} files")
-    elif options.method:
-        _run(options)
     else:
-        raise UserError(
-            "method: expected the name of a method, such as ftl_igm, or --list, --check, --leaderboard or --data, found none"
-        )
+        expected = "the name of a method, such as ftl_igm, or --list, --check, --leaderboard or --data"
+        require(options.method, "method", expected, "none")
+        _run(options)
 
 
 def _named(text: str, key: str) -> list[str]:
@@ -123,10 +121,9 @@ def _named(text: str, key: str) -> list[str]:
     from ftl_lightning.apps.benchmark.suite import suite_names
 
     names = [name.strip() for name in text.split(",") if name.strip()]
-    if unknown := [name for name in names if name not in suite_names()]:
-        raise UserError(f"{key}: expected some of {', '.join(suite_names())}, found {short(unknown[0])!r}")
-    if len(set(names)) < len(names):
-        raise UserError(f"{key}: expected each suite once, found {short(text)!r}")
+    for name in names:
+        require(name in suite_names(), key, f"some of {', '.join(suite_names())}", repr(short(name)))
+    require(len(set(names)) == len(names), key, "each suite once", repr(short(text)))
     return names
 
 
@@ -150,8 +147,7 @@ def _chosen(options: BenchmarkOptions) -> list[str]:
             raise UserError(missing)
         else:
             say(line(f"note: left out: {missing}"), error=True)
-    if not chosen:
-        raise UserError("suites: expected one or more, found none that can be run here")
+    require(chosen, "suites", "one or more", "none that can be run here")
     return chosen
 
 
@@ -159,8 +155,8 @@ def _run(options: BenchmarkOptions) -> None:
     from ftl_lightning.apps.benchmark.run import run_benchmark
     from ftl_lightning.apps.benchmark.submission import Submission, machine
     from ftl_lightning.apps.benchmark.suite import SEEDS, load_suite
-    from ftl_lightning.services.representation import counted
-    from ftl_lightning.services.targets import check_writable_file
+    from ftl_lightning.services.files import check_writable_file
+    from ftl_lightning.services.text import counted
     from ftl_lightning.training.method import code_hash, load_method
 
     out = Path(options.out)
@@ -179,8 +175,9 @@ def _run(options: BenchmarkOptions) -> None:
     if out.is_file():
         begun = _resumed(Submission.load(out), begun, out)
         say(f"{out}: {counted(len(begun.runs), 'run')} kept")
-    elif work.exists():
-        raise UserError(f"{work}: expected no models and logs of another run, found some; remove the folder or give another --out")
+    else:
+        advice = "some; remove the folder or give another --out"
+        require(not work.exists(), str(work), "no models and logs of another run", advice)
     entry = _entry(options, work)
     for name in names:  # report mistakes early
         entry.cells(load_suite(name), _numbers(options)[0])
@@ -204,22 +201,23 @@ def _resumed(known: "Submission", begun: "Submission", out: Path) -> "Submission
     from dataclasses import replace
 
     for key in ("kind", "format", "method", "name", "code", "version", "machine"):
-        if getattr(known, key) != getattr(begun, key):
-            raise UserError(f"{out}: expected a submission of the same {key}, found another; give --out another file")
+        equal = getattr(known, key) == getattr(begun, key)
+        require(equal, str(out), f"a submission of the same {key}", "another; give --out another file")
     for name in set(known.suites) & set(begun.suites):
-        if known.suites[name] != begun.suites[name]:
-            raise UserError(f"{out}: suite {name}: expected the hash {begun.suites[name]}, found another; give --out another file")
+        equal = known.suites[name] == begun.suites[name]
+        require(equal, f"{out}: suite {name}", f"the hash {begun.suites[name]}", "another; give --out another file")
     seeds = [*known.seeds, *(seed for seed in begun.seeds if seed not in known.seeds)]
     return replace(known, suites={**known.suites, **begun.suites}, seeds=sorted(seeds))
 
 
 def _check(options: BenchmarkOptions) -> None:
     from ftl_lightning.apps.benchmark.check import check_submission, recompute
-    from ftl_lightning.services.representation import counted
+    from ftl_lightning.services.text import counted
 
     path = Path(options.check)
-    if (options.salt or options.recompute != BenchmarkOptions.recompute) and not options.method:
-        raise UserError("recompute: expected the installed method, too: ftl-lightning benchmark METHOD --check FILE, found none")
+    if options.salt or options.recompute != BenchmarkOptions.recompute:
+        command = "ftl-lightning benchmark METHOD --check FILE"
+        require(options.method, "recompute", f"the installed method, too: {command}", "none")
     submission, suites = check_submission(path)
     rows = sum(len(run.rows) for run in submission.runs)
     counts = f"{counted(len(suites), 'suite')}, {counted(len(submission.runs), 'run')}, {counted(rows, 'row')}"
@@ -232,5 +230,87 @@ def _check(options: BenchmarkOptions) -> None:
     differences = recompute(_entry(options, Path()), submission, suites, options.recompute, options.salt)
     for difference in differences:
         say(line(f"differs: {difference}"))
-    if differences:
-        raise UserError(f"{path}: expected the submitted numbers, found {len(differences)} that differ; see above")
+    require(not differences, str(path), "the submitted numbers", f"{len(differences)} that differ; see above")
+
+
+MOST_WORKERS = 1000
+"""Maximum number of parallel cells."""
+
+
+@dataclass(frozen=True)
+class AblateOptions:
+    """Run every cell of an ablation that is not in the results.
+
+    Attributes:
+        stages: verbs with grids of options, in order.
+        results: results file to which rows are added.
+        seeds: each stage runs once per seed.
+        shard: "3/8" for the third of eight parts; models that it does not make itself must exist.
+        executor: "ray" (the extra "cluster") runs cells in parallel on a Ray cluster, or on this machine's processors.
+        root: folder of recordings, for domains that read one: data.root of every cell.
+        address: address of the Ray cluster's head, HOST:PORT; empty for RAY_ADDRESS, or else a cluster on this machine.
+        only: numbers of the stages to run, from 1; empty for all.
+        estimate: run nothing; print the number of cells to run and the estimated hours.
+        status: run nothing; print the table of cells with their states, also while another process runs them.
+        slurm: run nothing; write a script for Slurm's sbatch to this file, or several in order, whose jobs run shards.
+        workers: parallel cells, for the estimate; jobs of each Slurm array (0: a job per cell).
+        sbatch: more options of sbatch by name, such as {partition: long, time: "02:00:00"}.
+    """
+
+    stages: list[Stage]
+    results: str
+    seeds: list[int] = field(default_factory=lambda: [0])
+    shard: str = "1/1"
+    executor: Literal["local", "ray"] = "local"
+    root: str = ""
+    address: str = ""
+    only: list[int] = field(default_factory=list)
+    estimate: bool = False
+    status: bool = False
+    slurm: str = ""
+    workers: int = 0
+    sbatch: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        check_count("workers", self.workers, 0, MOST_WORKERS)
+
+
+def ablate(options: AblateOptions) -> None:
+    """Run the cells, or print or write what the options ask for instead."""
+    from ftl_lightning.apps.ablation.run import planned, run_ablation, show_cells, show_estimate
+
+    stages, seeds, results = options.stages, options.seeds, options.results
+    if not (options.estimate or options.status or options.slurm):
+        return run_ablation(stages, seeds, results, options.shard, options.executor, options.root, options.address, options.only)
+    plan = planned(stages, seeds, options.root, options.only)
+    if options.estimate:
+        show_estimate(list(plan.values()), results, options.workers)
+    if options.status:
+        show_cells(results, [cell for cells in plan.values() for cell in cells])
+    if options.slurm:
+        from ftl_lightning.apps.ablation.run import check
+        from ftl_lightning.apps.ablation.slurm import write_scripts
+
+        check([cell for cells in plan.values() for cell in cells])
+        keys = {"results": results, "seeds": list(seeds), "root": options.root}
+        say("\n".join(write_scripts(options.slurm, stages, plan, keys, options.workers, options.sbatch)))
+
+
+def report(results: str = "results", out: str = "results/report", readme: str = "", html: str = "") -> None:
+    """Make tables and figures from results, with the paper's numbers; or an HTML page.
+
+    Args:
+        results: a results file, or a folder of results files.
+        out: folder for Markdown, LaTeX and figures.
+        readme: a Markdown file to update between its marks.
+        html: HTML file to write instead: overview, films, concepts and curves, without a network.
+    """
+    if html:
+        from ftl_lightning.reporting.page import write_page
+
+        say(f"{html}: {write_page(Path(results), Path(html)) / 1e6:.1f} MB")
+        return
+    from ftl_lightning.reporting.report import write_report
+
+    say(write_report(Path(results), Path(out), Path(readme) if readme else None))
+    say(f"written to {out}")

@@ -1,0 +1,155 @@
+"""Print, describe and escape texts.
+
+Names come from files, which others may have written. All printed text goes through :func:`say`, all text in a line of a table, a
+figure or a message through :func:`line`.
+"""
+
+import html
+import io
+import json
+import re
+import sys
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+from unicodedata import category
+
+from ftl_lightning.services.errors import LONGEST, short
+
+
+def plain(text: str) -> str:
+    """Replace unprintable characters by question marks, but for line breaks and tabs, and wide spaces by plain ones."""
+    return "".join(char if char.isprintable() or char in "\n\t" else " " if category(char) == "Zs" else "?" for char in text)
+
+
+def line(text: str) -> str:
+    """:func:`plain` in a single line, with single spaces."""
+    return plain(" ".join(text.split()))
+
+
+@dataclass
+class _Voice:
+    silent: bool = False
+
+
+_VOICE = _Voice()
+
+
+def silence() -> None:
+    """Print nothing from now on: of several processes of a run only the first prints."""
+    _VOICE.silent = True
+
+
+def say(*parts: object, error: bool = False) -> None:
+    """Print a text by :func:`plain`, at once.
+
+    Args:
+        parts: values, separated by spaces.
+        error: whether to print to standard error.
+    """
+    if not _VOICE.silent:
+        print(*(plain(str(part)) for part in parts), file=sys.stderr if error else sys.stdout, flush=True)
+
+
+def any_terminal() -> None:
+    """Let standard output replace characters that its encoding lacks, such as ± in ASCII, by question marks."""
+    if isinstance(sys.stdout, io.TextIOWrapper):  # not a notebook's
+        sys.stdout.reconfigure(errors="replace")
+
+
+MOST_NUMBERS = 6
+"""Maximum number of values shown of a list."""
+
+
+class Shown(ABC):
+    """Object with a short representation."""
+
+    @abstractmethod
+    def _words(self) -> Iterable[str]:
+        """Descriptive words, most important first."""
+
+    def __repr__(self) -> str:
+        return short(f"{type(self).__name__}({', '.join(map(short, self._words()))})", LONGEST)
+
+    def _repr_html_(self) -> str:
+        """HTML for notebooks; names come from files, so they are escaped."""
+        items = "".join(f"<li>{html.escape(short(word))}</li>" for word in self._words())
+        return f"<b>{html.escape(type(self).__name__)}</b><ul>{items}</ul>"
+
+
+def numbers(values: Sequence[float]) -> str:
+    """Short text of numbers."""
+    text = ", ".join(f"{value:.2f}" for value in values[:MOST_NUMBERS])
+    return text if len(values) <= MOST_NUMBERS else f"{text}, ..."
+
+
+def counted(count: int, what: str) -> str:
+    """Count with a noun, such as ``'1 mode'`` and ``'5 modes'``."""
+    return f"{count:,} {what}" if count == 1 else f"{count:,} {what}s"
+
+
+_LATEX = str.maketrans(
+    {
+        "\\": r"\textbackslash{}",
+        "{": r"\{",
+        "}": r"\}",
+        "$": r"\$",
+        "&": r"\&",
+        "%": r"\%",
+        "#": r"\#",
+        "_": r"\_",
+        "^": r"\textasciicircum{}",
+        "~": r"\textasciitilde{}",
+        "`": r"\textasciigrave{}",
+        "|": r"\textbar{}",
+        "±": r"$\pm$",
+        "<": "$<$",
+        ">": "$>$",
+    }
+)
+_MARKDOWN = re.compile(
+    r"""[\\`*|~${}>&]
+    | <(?=\S)  # a tag, a comment or a link; 'p < .001' is none
+    | (?<=\])[(\[:] | \[(?=[\[^]) | !(?=\[)  # links, pictures and footnotes; '0.82 [0.67]' is none
+    | (?<![^\W_])_ | _(?![^\W_])  # emphasis; 'a_name' has none
+    | :(?=//) | (?<=www)\.  # addresses that become links by themselves
+    """,
+    re.VERBOSE | re.IGNORECASE,
+)
+_ENTITIES = {"<": "&lt;", ">": "&gt;", "&": "&amp;"}
+_SCRIPT = str.maketrans({letter: f"\\u{ord(letter):04x}" for letter in "<>&\u2028\u2029"})
+MOST_DRAWN = 120
+"""Maximum characters of a name in a figure."""
+
+
+def latex(text: str) -> str:
+    """Escape a text for LaTeX in one line, without commands and formulas.
+
+    A table row that begins with a bracket or an asterisk needs an empty group before it, see :func:`latex_row`.
+    """
+    return line(text).translate(_LATEX)
+
+
+def latex_row(cells: list[str]) -> str:
+    r"""Cells of a LaTeX table row. Without the empty group, ``\\`` of the previous row would take a bracket as its argument."""
+    row = " & ".join(map(latex, cells))
+    return ("{}" if row.startswith(("[", "*")) else "") + row + r" \\"
+
+
+def markdown(text: str) -> str:
+    """Escape a text for a cell or caption in GitHub's Markdown: one line, no HTML, link, picture, formula, code or new cell."""
+    return _MARKDOWN.sub(lambda match: _ENTITIES.get(match[0], f"\\{match[0]}"), line(text))
+
+
+def script_json(content: Any) -> str:
+    """JSON for a ``script`` element of HTML, which can neither end the element nor begin a comment."""
+    return json.dumps(content, ensure_ascii=False, separators=(",", ":")).translate(_SCRIPT)
+
+
+def figure_text(text: str) -> str:
+    """Escape a text for a figure in one line: matplotlib reads text between dollars as a formula, and a legend omits names that
+    begin with ``_``.
+    """
+    label = short(line(text), MOST_DRAWN).replace("$", r"\$")
+    return f" {label}" if label.startswith("_") else label
