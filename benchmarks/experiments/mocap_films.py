@@ -18,8 +18,8 @@ from torch import Tensor
 from ftl_lightning.cli.pages import StudyOptions, study
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.mocap.domain import DOMAIN
-from ftl_lightning.domains.mocap.skeleton import COLUMNS
-from ftl_lightning.domains.mocap.source import NAME, Recorded
+from ftl_lightning.domains.mocap.skeleton import COLUMNS, NAME
+from ftl_lightning.domains.mocap.source import Recorded
 from ftl_lightning.domains.mocap.tasks import TEST_CONCEPTS
 from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.networks.text_encoder import TableEncoder

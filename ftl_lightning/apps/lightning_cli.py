@@ -34,6 +34,8 @@ from ftl_lightning.training.trainer import Trainer, one_voice
 class CommandLine(LightningCLI):
     """Lightning's command line with the verb ``invert``."""
 
+    trainer: Trainer
+
     def __init__(self, model: type, data: type, args: list[str], **options: Any) -> None:
         self._asked = args[0] if args else ""
         super().__init__(model, data, args=args, **options)

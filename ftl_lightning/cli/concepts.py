@@ -86,8 +86,7 @@ def concepts(pretrained: str, folder: list[str] = [], plain: bool = False) -> No
     with about(place / CONFIG):
         texts = check_type(content.get("training_concepts"), Sequence[str], "training_concepts")
     if not plain:
-        from ftl_lightning.igm.library import library
-        from ftl_lightning.training.library import table
+        from ftl_lightning.igm.library import library, table
 
         known = library(content["hash"], texts, place, folder)
     for text in texts:

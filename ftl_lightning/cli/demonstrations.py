@@ -93,9 +93,9 @@ def prepare(domain: str, root: str = "", out: str = "") -> None:
     from ftl_lightning.domains.registry import load_domain
 
     loaded = load_domain(domain)
-    if loaded.prepare is None:
+    if loaded.recordings.prepare is None:
         raise UserError(f"domain: expected one whose recordings are prepared, found {domain!r}, which needs nothing of the kind")
-    say(loaded.prepare(Path(root) if root else None, Path(out) if out else None))
+    say(loaded.recordings.prepare(Path(root) if root else None, Path(out) if out else None))
 
 
 @dataclass(frozen=True)
@@ -141,11 +141,11 @@ def check(options: CheckOptions) -> None:
         for text_line in str(checks[-1]).splitlines():
             say(f"{text_line[: len(text_line) - len(text_line.lstrip())]}{line(text_line)}")
     if options.figure:
-        from ftl_lightning.reporting.check_figure import picture
+        from ftl_lightning.reporting.concept_figures import check_figure
         from ftl_lightning.services.tensor_file import atomic
 
         with atomic(options.figure) as temporary:
-            picture(checks).savefig(temporary, dpi=110)
+            check_figure(checks).savefig(temporary, dpi=110)
         say(options.figure)
 
 

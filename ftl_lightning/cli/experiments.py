@@ -277,12 +277,13 @@ class AblateOptions:
 
 def ablate(options: AblateOptions) -> None:
     """Run the cells, or print or write what the options ask for instead."""
+    from ftl_lightning.apps.ablation.plan import part
     from ftl_lightning.apps.ablation.run import planned, run_ablation, show_cells, show_estimate
 
     stages, seeds, results = options.stages, options.seeds, options.results
-    if not (options.estimate or options.status or options.slurm):
-        return run_ablation(stages, seeds, results, options.shard, options.executor, options.root, options.address, options.only)
     plan = planned(stages, seeds, options.root, options.only)
+    if not (options.estimate or options.status or options.slurm):
+        return run_ablation(part(list(plan.values()), options.shard), results, options.executor, options.address)
     if options.estimate:
         show_estimate(list(plan.values()), results, options.workers)
     if options.status:

@@ -31,11 +31,11 @@ from ftl_lightning.domains.execution import ClosedLoop, Rollout
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.evaluation.closed_loop import PlanFollower, fixed_plans, roll_out
 from ftl_lightning.evaluation.generation import TaskResult
+from ftl_lightning.igm.forms.quality import first_windows
 from ftl_lightning.services.errors import require
 from ftl_lightning.services.progress import bar
 from ftl_lightning.services.randomness import FRESH_SEED
 from ftl_lightning.services.tensor_file import bytes_hash
-from ftl_lightning.training.quality import first_windows
 
 _LOG = logging.getLogger(__name__)
 

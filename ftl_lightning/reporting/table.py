@@ -8,7 +8,7 @@ from typing import NoReturn
 import numpy as np
 import pandas as pd
 
-from ftl_lightning.domains.comparison import OURS, PAPERS_METHOD, Compared, Published
+from ftl_lightning.domains.comparison import OURS, PAPERS_METHOD, Compared, Comparison, Published
 from ftl_lightning.domains.domain import CLOSED, COVERAGE, EXECUTED, NOVELTY, Concepts, Domain, Metric, Plans
 from ftl_lightning.domains.from_file import OWN
 from ftl_lightning.domains.registry import domain_of_file, is_known
@@ -144,8 +144,9 @@ def domain_of(name: str, rows: pd.DataFrame) -> Domain:
     except UserError:
         measured = rows.loc[(rows["domain"] == name) & ~rows["metric"].str.startswith((CLOSED, WON, LOST)), "metric"]
         metrics = {metric: Metric(_unknown) for metric in dict.fromkeys(measured) if metric not in (NOVELTY, COVERAGE)}
+        comparison = Comparison(headline=next(iter(metrics), EXECUTED))
         concepts = Concepts(training=(), suites={}, descriptions=(), reads=lambda text: False)
-        return Domain(name, Plans(0, (), ()), concepts, _unknown, metrics=metrics, headline=next(iter(metrics), EXECUTED))
+        return Domain(name, Plans(0, (), ()), concepts, _unknown, metrics=metrics, comparison=comparison)
 
 
 def _unknown(*arguments: object) -> NoReturn:

@@ -358,9 +358,10 @@ def device_named(name: object) -> "torch.device":
     import torch
 
     expected = f"one that this machine has, {' or '.join(_devices())}"
-    require(isinstance(name, str | torch.device), "device", expected, shown(name))
+    if not isinstance(name, str | torch.device):
+        raise UserError(f"device: expected {expected}, found {shown(name)}")
     try:
-        device = torch.device(name)  # type: ignore[arg-type]
+        device = torch.device(name)
         torch.ones(1, device=device).cpu()  # a valid name may be unavailable
     except (RuntimeError, AssertionError, NotImplementedError) as error:
         # An available device may be out of memory or broken.
