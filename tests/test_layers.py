@@ -19,10 +19,8 @@ LAYERS = (
     ("cli", "__init__"),
     ("__main__",),
 )
-"""From the lowest. Folders on one layer do not import each other, except for :data:`NETWORKS_USE`."""
+"""From the lowest. Folders on one layer do not import each other."""
 LEVEL = {part: level for level, parts in enumerate(LAYERS) for part in parts}
-NETWORKS_USE = ("networks", "igm")
-"""Denoisers implement the interface of the composed denoiser."""
 
 
 def part_of(path: Path) -> str:
@@ -56,7 +54,7 @@ def test_every_module_has_a_layer() -> None:
 
 @pytest.mark.parametrize("part", sorted(LEVEL))
 def test_nothing_imports_its_own_layer_or_a_higher_one(part: str) -> None:
-    allowed = {other for other in LEVEL if LEVEL[other] < LEVEL[part] or other == part or (part, other) == NETWORKS_USE}
+    allowed = {other for other in LEVEL if LEVEL[other] < LEVEL[part] or other == part}
     violations = {
         f"{path.relative_to(ROOT)}: {other}"
         for path in FILES

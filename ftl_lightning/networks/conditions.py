@@ -15,10 +15,11 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ftl_lightning.data.features import Feature
-from ftl_lightning.igm.diffusion import Context
 from ftl_lightning.networks.image_encoder import POINT
 from ftl_lightning.services.errors import require, shown
 
+Context = tuple[Tensor, ...]
+"""Output of a condition encoder, each ``(batch, ...)``; empty without observed features."""
 CHOSEN = 4
 """Number of image points that a concept chooses."""
 SHARPNESS = 4.0

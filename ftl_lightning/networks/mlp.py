@@ -6,8 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ftl_lightning.igm.diffusion import Context
-from ftl_lightning.networks.conditions import Sizes, condition_encoder, sinusoidal_embedding, turned
+from ftl_lightning.networks.conditions import Context, Sizes, condition_encoder, sinusoidal_embedding, turned
 from ftl_lightning.services.errors import require
 from ftl_lightning.services.randomness import Dropout
 from ftl_lightning.services.validation import check_range

@@ -8,8 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ftl_lightning.igm.diffusion import Context
-from ftl_lightning.networks.conditions import Sizes, condition_encoder, sinusoidal_embedding
+from ftl_lightning.networks.conditions import Context, Sizes, condition_encoder, sinusoidal_embedding
 from ftl_lightning.services.errors import require
 
 MOST_CLOCK = 256

@@ -24,8 +24,7 @@ from ftl_lightning.training.checks import longer_than_plans, notes_of
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.data import InversionData
 from ftl_lightning.training.labels import Labels
-from ftl_lightning.training.method import kinds_for
-from ftl_lightning.training.model_folder import load_model
+from ftl_lightning.training.model_folder import kinds_for, load_model
 from ftl_lightning.training.quality import Inspection, inspected, judging_domain
 
 

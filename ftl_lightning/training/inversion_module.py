@@ -23,10 +23,11 @@ from ftl_lightning.igm.settings import (
 from ftl_lightning.services.option_groups import flat, groups_of
 from ftl_lightning.services.progress import bar
 from ftl_lightning.services.text import counted
-from ftl_lightning.training.adaptation import Adaptation
+from ftl_lightning.training.adaptation import Adaptation, LearnerAdaptation
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.in_processes import learned_in_processes
 from ftl_lightning.training.labels import labels
+from ftl_lightning.training.method import Method
 
 _USUAL = InversionSettings()
 
@@ -104,3 +105,10 @@ class InversionModule(Adaptation):
     def training_weight(self, task: EvaluationTask) -> float:
         omega = self.settings.weights.training if task.learned else None
         return super().training_weight(task) if omega is None else omega
+
+
+def adaptation_of(method: Method) -> type[Adaptation]:
+    """The LightningModule of ``invert`` for a method's models."""
+    if method.adaptation is not None:
+        return method.adaptation()
+    return InversionModule if method.model is None or method.model().invertible else LearnerAdaptation

@@ -13,9 +13,6 @@ from ftl_lightning.services.trust import entry_points
 
 if TYPE_CHECKING:
     from ftl_lightning.domains.domain import Domain
-    from ftl_lightning.training.adaptation import Adaptation
-    from ftl_lightning.training.concept_model import ConceptModel
-    from ftl_lightning.training.pretraining import Pretraining
 
 
 @dataclass(frozen=True)
@@ -55,9 +52,9 @@ class Method:
 
     name: str
     kind: str
-    model: "Callable[[], type[ConceptModel]] | None" = None
-    pretraining: "Callable[[], type[Pretraining[Any]]] | None" = None
-    adaptation: "Callable[[], type[Adaptation]] | None" = None
+    model: Callable[[], type[Any]] | None = None
+    pretraining: Callable[[], type[Any]] | None = None
+    adaptation: Callable[[], type[Any]] | None = None
     forms: Sequence[Form] = ()
     configurations: str = ""
     suits: "Callable[[Domain], None]" = lambda domain: None
@@ -70,15 +67,6 @@ class Method:
         """
         with about(f"method {self.name}"):
             self.suits(domain)
-
-    def adaptation_class(self) -> "type[Adaptation]":
-        """The LightningModule of ``invert``."""
-        from ftl_lightning.training.adaptation import LearnerAdaptation
-        from ftl_lightning.training.inversion_module import InversionModule
-
-        if self.adaptation is not None:
-            return self.adaptation()
-        return InversionModule if self.model is None or self.model().invertible else LearnerAdaptation
 
     def form(self, hparams: Mapping[str, Any]) -> str:
         """Form of concepts for these options; empty for the paper's form."""
@@ -177,16 +165,6 @@ def methods() -> Iterator[Method]:
 def kinds() -> list[str]:
     """All kinds of pretrained models."""
     return [method.kind for method in methods() if method.model]
-
-
-def kinds_for(adapts: "Callable[[type[ConceptModel]], bool]") -> list[str]:
-    """Kinds of models whose class has a property."""
-    return [method.kind for method in methods() if method.model and adapts(method.model())]
-
-
-def model_class(kind: str) -> "type[ConceptModel] | None":
-    """The network's class for a kind of models; ``None`` if no installed package offers it."""
-    return next((method.model() for method in methods() if method.model and method.kind == kind), None)
 
 
 def class_path(kind: type) -> str:

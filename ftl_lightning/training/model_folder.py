@@ -1,7 +1,7 @@
 """Folder of a pretrained model: ``config.json``, ``model.safetensors``, and examples of a user's data."""
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -20,7 +20,7 @@ from ftl_lightning.services.shipped import pretrained_folder
 from ftl_lightning.services.tensor_file import alone, check_finite, file_hash, load_tensors, save_tensors, write_text
 from ftl_lightning.services.validation import from_mapping
 from ftl_lightning.training.concept_model import KIND, ConceptModel
-from ftl_lightning.training.method import kinds, model_class
+from ftl_lightning.training.method import kinds, methods
 from ftl_lightning.training.model_config import CONFIG, VERSION, blank, check_domain, read_config
 
 M = TypeVar("M", bound=ConceptModel)
@@ -141,6 +141,16 @@ def check_weights(found: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -
             raise UserError(f"does not fit {CONFIG}: key {short(name)!r}: expected {kinds[0]}, found {kinds[1]}")
         if tensor.is_floating_point() and tensor.numel() and not torch.stack(tensor.aminmax()).isfinite().all():
             raise UserError(f"key {short(name)!r}: expected finite numbers, found others; take another copy of both files")
+
+
+def kinds_for(adapts: Callable[[type[ConceptModel]], bool]) -> list[str]:
+    """Kinds of models whose class has a property."""
+    return [method.kind for method in methods() if method.model and adapts(method.model())]
+
+
+def model_class(kind: str) -> type[ConceptModel] | None:
+    """The network's class for a kind of models; ``None`` if no installed package offers it."""
+    return next((method.model() for method in methods() if method.model and method.kind == kind), None)
 
 
 def load_model(folder: str | Path, domain: Domain | str | None = None) -> ConceptModel:

@@ -10,7 +10,8 @@ import pytest
 
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.few_shot.learner import FewShot
-from ftl_lightning.training.method import load_method, method_names, model_class
+from ftl_lightning.training.method import load_method, method_names
+from ftl_lightning.training.model_folder import model_class
 from tests.conftest import ROOT, Once, python, succeed
 from tests.domains.test_plug_in import VERBS, installed
 

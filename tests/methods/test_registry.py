@@ -13,14 +13,16 @@ from ftl_lightning.methods.lora.adaptation import FineTuning
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.training.adaptation import Adaptation, LearnerAdaptation
 from ftl_lightning.training.concept_model import ConceptModel
-from ftl_lightning.training.inversion_module import InversionModule
-from ftl_lightning.training.method import SHIPPED, Form, Method, kinds, kinds_for, load_method, method_names, methods, model_class
+from ftl_lightning.training.inversion_module import InversionModule, adaptation_of
+from ftl_lightning.training.method import SHIPPED, Form, Method, kinds, load_method, method_names, methods
+from ftl_lightning.training.model_folder import kinds_for, model_class
 from ftl_lightning.training.pretraining import Pretraining
 from tests.conftest import ROOT
 
 KINDS = ["diffusion", "bc", "cvae", "in-context"]
 MODULE = """
-from ftl_lightning.training.method import Method
+from ftl_lightning.training.method import SHIPPED, Form, Method, kinds, load_method, method_names, methods
+from ftl_lightning.training.model_folder import kinds_for, model_class
 METHOD = Method(name="echo", kind="diffusion")
 NOTHING = "a text"
 """
@@ -58,7 +60,7 @@ def test_the_six_are_offered_in_the_order_of_tables() -> None:
 @pytest.mark.parametrize("name", SHIPPED)
 def test_each_has_its_classes(name: str) -> None:
     method = load_method(name)
-    assert issubclass(method.adaptation_class(), Adaptation)
+    assert issubclass(adaptation_of(method), Adaptation)
     assert method.configurations in ("conf", f"conf/{name}")
     if method.model is None or method.pretraining is None:
         assert method.kind == "diffusion"

@@ -62,8 +62,8 @@ def _check(cell: Cell, made: set[str]) -> None:
     from ftl_lightning.apps.lightning_cli import parse
     from ftl_lightning.domains.registry import load_domain
     from ftl_lightning.networks.text_encoder import load_encoder
-    from ftl_lightning.training.method import kinds_for, model_class
     from ftl_lightning.training.model_config import read_config
+    from ftl_lightning.training.model_folder import kinds_for, model_class
 
     config = parse(cell.verb, cell.arguments)
     model, data = config["model"]["init_args"], config["data"]["init_args"]

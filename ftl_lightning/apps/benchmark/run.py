@@ -20,6 +20,7 @@ from ftl_lightning.services.progress import bar
 from ftl_lightning.services.shipped import pretrained_folder, shipped
 from ftl_lightning.services.tensor_file import write_text
 from ftl_lightning.services.text import say
+from ftl_lightning.training.inversion_module import adaptation_of
 from ftl_lightning.training.method import Method, class_path, load_method
 from ftl_lightning.training.model_config import CONFIG
 
@@ -79,7 +80,7 @@ class Candidate:
             UserError: if no file names the method's adaptation class.
         """
         path, added = self.configuration(suite), shipped(f"conf/method/{self.method}.yaml")
-        expected = self.declared.adaptation_class().__name__
+        expected = adaptation_of(self.declared).__name__
         for files in ((path,), (path, added)):
             classes = [str((load(file, "invert").get("model") or {}).get("class_path", "")) for file in files if file.is_file()]
             if classes[-1].rpartition(".")[2] == expected:
@@ -96,7 +97,7 @@ class Candidate:
                 "model": {"class_path": class_path(method.pretraining())} if method.pretraining else {},
                 "data": {"class_path": "ftl_lightning.training.data.PretrainingData"},
             },
-            "invert": {"model": {"class_path": class_path(method.adaptation_class())}},
+            "invert": {"model": {"class_path": class_path(adaptation_of(method))}},
         }
         write_text(path, yaml.safe_dump(content))
         return path
