@@ -10,16 +10,15 @@ from typing import Any
 import lightning.pytorch as pl
 from lightning.pytorch.loggers import TensorBoardLogger
 
-from ftl_lightning.evaluation.chosen import chosen
 from ftl_lightning.evaluation.diversity import lines, real_behaviour
 from ftl_lightning.evaluation.drawing import draw
 from ftl_lightning.evaluation.evaluable import Evaluable, is_evaluable
 from ftl_lightning.evaluation.films import write_films
 from ftl_lightning.evaluation.generation import Generation, execute, generate, tasks_of
 from ftl_lightning.evaluation.judged import TaskResult
-from ftl_lightning.evaluation.record import record
 from ftl_lightning.evaluation.references import references
-from ftl_lightning.evaluation.rows import config_hash, configuration, rows
+from ftl_lightning.evaluation.results import config_hash, configuration, rows
+from ftl_lightning.evaluation.summary import hparams_of, record
 from ftl_lightning.evaluation.tensorboard import log_projector, log_test, own_rows, setting_means
 from ftl_lightning.services.errors import UserError, short
 from ftl_lightning.services.printing import say
@@ -93,8 +92,8 @@ class Evaluator(pl.Callback):
             "steps": generation.steps,
             "temperature": generation.temperature,
             "sample_seed": generation.seed,
-            **({"replan": generation.replan} if self.closed_loop else {}),
-            **({"environments": list(generation.environments)} if generation.environments else {}),
+            "replan": generation.replan if self.closed_loop else None,
+            "environments": list(generation.environments),
         }
 
     def config_hash(self, module: Evaluable, data: pl.LightningDataModule, trainer: pl.Trainer) -> str:
@@ -157,7 +156,7 @@ class Evaluator(pl.Callback):
             self._draw(logger, module, trainer.global_step)
             self._project(logger, module, trainer.global_step)
             if method_rows:
-                log_test(logger, chosen(module, data, self.settings(data), trainer, method_rows), measured, trainer.global_step)
+                log_test(logger, hparams_of(module, data, self.settings(data), trainer, method_rows), measured, trainer.global_step)
 
     def _generate(self, module: Evaluable, data: PretrainingData | InversionData) -> None:
         tasks = tasks_of(module.domain, self._suite_names(data), module.concepts)

@@ -16,7 +16,7 @@ from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.vector_film import Shape, VectorFilm, of_wireframe
 from ftl_lightning.domains.wireframe import Wireframe
 from ftl_lightning.evaluation.judged import TaskResult
-from ftl_lightning.evaluation.row import METHOD, Row
+from ftl_lightning.evaluation.results import METHOD, Row
 from ftl_lightning.services.tensor_file import write_text
 
 FILMED = 4

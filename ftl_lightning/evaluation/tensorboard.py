@@ -20,7 +20,7 @@ from torch.utils.tensorboard.writer import FileWriter
 
 from ftl_lightning.evaluation.animation import captioned, gif
 from ftl_lightning.evaluation.judged import LOST, WON
-from ftl_lightning.evaluation.row import METHOD, Row
+from ftl_lightning.evaluation.results import METHOD, Row
 from ftl_lightning.evaluation.summary import plain, summary_table
 from ftl_lightning.igm.point import Part, Point
 from ftl_lightning.services.printing import line
@@ -52,7 +52,7 @@ def own_rows(rows: Sequence[Row]) -> list[Row]:
     """Rows of the method without reference lines and paired comparisons.
 
     Args:
-        rows: see :func:`ftl_lightning.evaluation.rows.rows`.
+        rows: see :func:`ftl_lightning.evaluation.results.rows`.
     """
     return [row for row in rows if row.role == METHOD and not row.metric.startswith((WON, LOST))]
 
@@ -63,7 +63,7 @@ def log_test(logger: TensorBoardLogger, settings: Mapping[str, Any], rows: Seque
 
     Args:
         logger: output.
-        settings: see :func:`ftl_lightning.evaluation.chosen.chosen`.
+        settings: see :func:`ftl_lightning.evaluation.summary.hparams_of`.
         rows: rows of the method and of reference lines.
         step: global step.
     """

@@ -3,8 +3,7 @@
 import pandas as pd
 
 from ftl_lightning.domains.domain import Domain
-from ftl_lightning.evaluation.results import latest
-from ftl_lightning.evaluation.row import METHOD
+from ftl_lightning.evaluation.results import METHOD, latest
 from ftl_lightning.reporting.shown import decisive, main_omega
 from ftl_lightning.reporting.table import MISSING, Table, select, summarise
 from ftl_lightning.reporting.tables import LEARNED

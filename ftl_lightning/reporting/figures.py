@@ -11,9 +11,8 @@ from matplotlib.lines import Line2D
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.paper import CHOSEN, OURS, Compared
 from ftl_lightning.evaluation.diversity import FRESH, REPLAYED
-from ftl_lightning.evaluation.results import latest
-from ftl_lightning.evaluation.row import REFERENCE
-from ftl_lightning.evaluation.row import label as method_label
+from ftl_lightning.evaluation.results import REFERENCE, latest
+from ftl_lightning.evaluation.results import label as method_label
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.reporting.colours import COLOURS, colours
 from ftl_lightning.reporting.colours import PAPER as PAPER_COLOUR

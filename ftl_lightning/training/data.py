@@ -1,4 +1,4 @@
-"""DataModules for pretraining (subclassed by domains) and for inversion (shared by all domains).
+"""DataModules for pretraining and inversion, shared by all domains.
 
 Both deliver demonstrations in the domain's units; the model normalises them. Each batch depends only on the seed and the step
 number, so an interrupted and resumed run matches an uninterrupted run.
@@ -7,7 +7,7 @@ number, so an interrupted and resumed run matches an uninterrupted run.
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import lightning.pytorch as pl
 import torch
@@ -74,11 +74,10 @@ class Windows:
 
 
 class PretrainingData(pl.LightningDataModule):
-    """Batches of (behaviour, concept) pairs of a domain. A subclass may name the domain.
+    """Batches of (behaviour, concept) pairs of a domain.
 
     Args:
-        domain: name of the domain, or ``package.module:DOMAIN``, see :func:`ftl_lightning.domains.registry.load_domain`; empty
-            for the class's domain.
+        domain: name of the domain, or ``package.module:DOMAIN``, see :func:`ftl_lightning.domains.registry.load_domain`.
         root: folder of the user's copy of the data, for domains whose demonstrations do not ship.
         samples_per_concept: demonstrations of each training concept.
         validation_per_concept: validation demonstrations of each training concept.
@@ -97,12 +96,9 @@ class PretrainingData(pl.LightningDataModule):
         UserError: for an invalid value.
     """
 
-    own_domain: ClassVar[str] = ""
-    """Name of the class's domain."""
-
     def __init__(
         self,
-        domain: str = "",
+        domain: str,
         root: str | None = None,
         samples_per_concept: int = 100,
         validation_per_concept: int = 10,
@@ -118,12 +114,8 @@ class PretrainingData(pl.LightningDataModule):
         super().__init__()
         chosen = Windows(**windows)
         windows = asdict(chosen)  # hyper-parameters are the local variables: include defaults
-        # Leave out unset new keys, so that older configurations keep their hash.
-        unsaid = {"balance": chosen.balance is None, "recoveries": not recoveries, "more": more is None}
-        self.save_hyperparameters(ignore=[name for name, absent in unsaid.items() if absent])
-        if self.own_domain and domain not in ("", self.own_domain):
-            raise UserError(f"data.domain: expected {self.own_domain!r} or none for {type(self).__name__}, found {domain!r}")
-        self.domain_name, self.domain = self._domain(self.own_domain or domain)
+        self.save_hyperparameters()
+        self.domain_name, self.domain = self._domain(domain)
         self._number = {text: number for number, text in enumerate(self.domain.concepts.training)}
         self.metrics: Mapping[str, float] = {}
         plans = self.domain.plans

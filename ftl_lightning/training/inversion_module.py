@@ -89,9 +89,7 @@ class InversionModule(ExactResume, Adaptation):
             "loss": loss,
         }
         self.save_hyperparameters(ignore=groups_of(INVERSION))
-        # Configurations older than these options keep their hash.
-        usual = {"start": _USUAL.embeddings.start, "screening": _USUAL.budget.screening, "precision": _USUAL.budget.precision}
-        self.save_hyperparameters({name: value for name, value in flat(groups, INVERSION).items() if value != usual.get(name)})
+        self.save_hyperparameters(flat(groups, INVERSION))
         self.settings = InversionSettings(
             components=components,
             omega=omega,

@@ -11,8 +11,7 @@ import torch
 from ftl_lightning.cli.main import main
 from ftl_lightning.domains.paper import Compared
 from ftl_lightning.domains.registry import load_domain
-from ftl_lightning.evaluation.results import append_rows, read_rows, read_study
-from ftl_lightning.evaluation.row import Row
+from ftl_lightning.evaluation.results import Row, append_rows, read_rows, read_study
 from ftl_lightning.igm.concept import Concept, Origin
 from ftl_lightning.reporting.changes import changes_table
 from ftl_lightning.reporting.colours import COLOURS, OF_METHODS, colours

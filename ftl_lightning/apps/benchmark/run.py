@@ -15,7 +15,7 @@ from ftl_lightning.apps.ablation.run import attempt
 from ftl_lightning.apps.benchmark.submission import GIVEN, PRETRAINED, Row, Run, Submission, score
 from ftl_lightning.apps.benchmark.suite import ASKED, TRAINING, BenchmarkSuite, load_suite
 from ftl_lightning.domains.registry import load_domain
-from ftl_lightning.evaluation.row import METHOD, REFERENCE
+from ftl_lightning.evaluation.results import METHOD, REFERENCE
 from ftl_lightning.services.configuration import load
 from ftl_lightning.services.errors import UserError, about, short
 from ftl_lightning.services.printing import say
