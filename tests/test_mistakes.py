@@ -183,7 +183,7 @@ OUT_OF_RANGE: Sequence[tuple[Callable[..., object], str, Mapping[str, Sequence[o
     (drawn, "data.{}: expected one of training, paper", {"suite": ["foo"]}),
     (drawn, "data.{}: expected a suite that learns concepts", {"suite": ["training"]}),
     (drawn, "{}: expected one of", {"domain": ["chess"]}),
-    (drawn, "data.{}, data.demonstrations_per_concept: expected 1 or more", {"steps": [0, -1]}),
+    (drawn, "data.{}: expected 1 or more", {"steps": [0, -1], "demonstrations_per_concept": [0]}),
     (drawn, "data.{}: expected 0 or more", {"seed": [-1]}),
     (Evaluator, "evaluation.{}: expected one of ddpm, ddim, dpm_solver, found 'foo'", {"sampler": ["foo"]}),
     (Evaluator, "evaluation.{}: expected a number from 0 to 1e+06", {"temperature": [1e38]}),

@@ -99,11 +99,11 @@ def configuration(
     files = {key: options[key] and _identity(options[key]) for key in ("demonstrations", "more") if key in options}
     groups: dict[str, Mapping[str, Any]] = {
         "model": {key: value for key, value in model.items() if key not in ("pretrained", "output")},
-        "data": {key: value for key, value in options.items() if key != "root"} | files,
+        "data": {key: value for key, value in options.items() if key not in ("domain", "root")} | files,
         "evaluation": settings,
         "trainer": getattr(trainer, "unusual", {}) if "pretrained" in model else {},
-        # Values of trained metrics depend on their weights. The identity of a rule is empty.
-        "metric": {name: metric.identity for name, metric in domain.metrics.items()},
+        # Values of trained metrics depend on their weights.
+        "metric": {name: metric.identity for name, metric in domain.metrics.items() if metric.identity},
     }
     loop = domain.closed_loop
     return {
