@@ -2,29 +2,42 @@
 
 Describe the cells of all plans by the code before and after the change, then rewrite the files:
 
-    git worktree add /tmp/before COMMIT
-    (cd /tmp/before && PYTHONPATH=. python ~+/benchmarks/making/rehash.py describe --out /tmp/before.json)
+    (cd BEFORE && PYTHONPATH=. python ~+/benchmarks/making/rehash.py describe --out /tmp/before.json)
     PYTHONPATH=. python benchmarks/making/rehash.py describe --out /tmp/after.json
-    python benchmarks/making/rehash.py rewrite --before /tmp/before.json --after /tmp/after.json
+    python benchmarks/making/rehash.py rewrite --before /tmp/before.json --after /tmp/after.json results/*.csv results/films/*.json
 
-A row belongs to a cell if it has the cell's hash before, or else if no other cell of its plan has the row's columns. ``rewrite``
-changes no other column, and lists rows that belong to no cell. Nothing is trained or generated; demonstrations are not read.
+Without ``--before`` the hashes before are those of version 1, which :func:`version_1` makes of the same descriptions. A row belongs
+to a cell if it has the cell's hash before, or else if no other cell of its plan has its columns. Other columns are kept. Rows
+that belong to no cell are listed. Nothing is trained or generated, and no demonstrations are read.
 """
 
 import argparse
 import csv
 import functools
-import importlib
 import json
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
 import yaml
+
+from ftl_lightning.apps.ablation.plan import Cell, Stage
+from ftl_lightning.apps.ablation.run import _log
+from ftl_lightning.apps.lightning_cli import build
+from ftl_lightning.domains.registry import load_domain
+from ftl_lightning.evaluation.evaluator import Evaluator
+from ftl_lightning.evaluation.results import config_hash, configuration, reference_hash
+from ftl_lightning.evaluation.summary import OWN
+from ftl_lightning.methods.language import adaptation as language
+from ftl_lightning.services import log_folder
+from ftl_lightning.services.tensor_file import content_hash
+from ftl_lightning.training import adaptation, data
+from ftl_lightning.training.inversion_settings import INVERSION, InversionSettings
+from ftl_lightning.version import __version__
 
 PLANS = [
     *(f"conf/ablation/{name}.yaml" for name in ("object_rearrangement", "agent", "driving", "mocap", "tabletop", "tabletop_wide")),
@@ -33,18 +46,10 @@ PLANS = [
     "benchmarks/making/films.yaml",
 ]
 HASH = "config_hash"
-SAME = ("domain", "method", "form", "variant", "K", "omega", "seed", "model_hash")
-"""Columns that a row shares with its cell."""
-
-
-def module(*names: str) -> ModuleType:
-    """The first module that exists: the code before a change may have other names."""
-    for name in names[:-1]:
-        try:
-            return importlib.import_module(name)
-        except ModuleNotFoundError:
-            continue
-    return importlib.import_module(names[-1])
+SAME = ("domain", "method", "form", "K", "omega", "seed", "model_hash")
+"""Columns that a row shares with its cell, besides the variant."""
+TRAITS = {"conf/ablation/agent.yaml": "flat", "conf/ablation/driving.yaml": "map"}
+"""Trait of a plan's models that do not ship; the names of their cells contain it."""
 
 
 class AnyText(str):
@@ -60,16 +65,11 @@ class AnyText(str):
 
 
 def describe(plans: Sequence[str], out: Path) -> None:
-    """Write the columns and hashes of every cell of ``invert``.
+    """Write the columns and the configuration of every cell of ``invert``, for the first of its seeds.
 
-    Where the pretrained model is missing, the cell is described with each model in the plan's results.
+    The domain's own model stands in for a missing pretrained model.
     """
-    runs = module("ftl_lightning.apps.ablation.run", "ftl_lightning.ablation.run")
-    stage = module("ftl_lightning.apps.ablation.plan", "ftl_lightning.ablation.plan").Stage
-    adaptation = module("ftl_lightning.training.adaptation", "ftl_lightning.learning.adaptation")
-    language = module("ftl_lightning.methods.language.adaptation")
-    data = module("ftl_lightning.training.data", "ftl_lightning.domains.data")
-    cells = []
+    described = []
     with (
         patch.object(data.InversionData, "_drawn", lambda *_: SimpleNamespace(concepts=())),
         patch.object(language, "load_encoder", lambda *_: SimpleNamespace(identity=AnyText())),
@@ -77,55 +77,33 @@ def describe(plans: Sequence[str], out: Path) -> None:
     ):
         for plan in plans:
             content = yaml.safe_load(Path(plan).read_text("utf-8"))
-            results = Path(content["results"])
-            models = {(row["domain"], row["model_hash"]) for row in _rows(results)} if results.is_file() else set()
-            planned = runs.planned([stage(**keys) for keys in content["stages"]], content["seeds"])
-            for number, cell in ((number, cell) for number, group in planned.items() for cell in group if cell.verb == "invert"):
-                for description in _described(cell, models):
-                    cells.append({"plan": plan, "results": str(results), "stage": number, "cell": cell.name, **description})
-                print(f"{plan}: {cell.name}", flush=True)
-            out.write_text(json.dumps(cells, indent=0), "utf-8")
+            for number, stage in enumerate((Stage(**keys) for keys in content["stages"]), 1):
+                seeds = list(stage.seeds or content["seeds"])
+                for cell in stage.cells(seeds[0]) if stage.verb == "invert" else ():
+                    where = {"plan": plan, "results": content["results"], "stage": number, "cell": cell.name, "seeds": seeds}
+                    described.append(where | _described(cell))
+                    print(f"{plan}: {cell.name}", flush=True)
+            out.write_text(json.dumps(described, indent=0), "utf-8")
 
 
-def _described(cell: Any, models: Iterable[tuple[str, str]]) -> list[dict[str, Any]]:
-    """Columns and hashes of a cell, by pretrained model."""
-    runs = module("ftl_lightning.apps.ablation.run", "ftl_lightning.ablation.run")
-    cli = module("ftl_lightning.apps.lightning_cli", "ftl_lightning.lightning_cli")
-    folders = module("ftl_lightning.services.log_folder", "ftl_lightning.log_folder")
-    hashing = module("ftl_lightning.evaluation.rows", "ftl_lightning.evaluation.results")
-    evaluators = module("ftl_lightning.evaluation.evaluator")
-    arguments = list(cell.arguments)
+def _described(cell: Cell) -> dict[str, Any]:
     option = "--model.pretrained="
-    missing = [text for text in arguments if text.startswith(option) and not Path(text.removeprefix(option)).is_dir()]
-    with folders.run():  # the domain's own model stands in for a missing one
-        line = cli.build(cell.verb, [text for text in arguments if text not in missing] + runs._log(cell))
-    evaluator = next(callback for callback in line.trainer.callbacks if isinstance(callback, evaluators.Evaluator))
+    missing = [text for text in cell.arguments if text.startswith(option) and not Path(text.removeprefix(option)).is_dir()]
+    with log_folder.run():
+        line = build(cell.verb, [text for text in cell.arguments if text not in missing] + _log(cell))
+    evaluator = next(callback for callback in line.trainer.callbacks if isinstance(callback, Evaluator))
     learner, hparams = line.model, line.model.hparams
-    hashes = {_model_hash(learner.model)}
-    hashes |= {model for domain, model in models if missing and model and domain == learner.domain.name}
-    described = []
-    for model in sorted(hashes):
-        with patch.object(type(learner.model), "hash", model):
-            configured = hashing.configuration(learner, line.datamodule, evaluator.settings(line.datamodule), line.trainer)
-        described.append(
-            {
-                "domain": learner.domain.name,
-                "method": learner.method,
-                "form": learner.form,
-                "variant": learner.variant if evaluator.variant is None else evaluator.variant,
-                "K": hparams.get("components", 0),
-                "omega": str(hparams.get("omega", hparams.get("guidance", "none"))),
-                "seed": hparams["seed"],
-                "model_hash": model,
-                "samples": configured["evaluation/samples"],
-                "suites": configured["evaluation/suites"],
-                "demonstrations": configured["data/demonstrations_per_concept"],
-                HASH: hashing.config_hash(configured),
-                "reference_hash": _reference_hash(hashing, configured),
-                "configuration": json.loads(json.dumps(configured, default=str)),
-            }
-        )
-    return described
+    with patch.object(type(learner.model), "hash", _model_hash(learner.model)):
+        configured = configuration(learner, line.datamodule, evaluator.settings(line.datamodule), line.trainer)
+    return {
+        "missing": bool(missing),
+        "form": learner.form,
+        "variant": learner.variant if evaluator.variant is None else evaluator.variant,
+        "K": hparams.get("components", 0),
+        "omega": str(hparams.get("omega", hparams.get("guidance", "none"))),
+        "data/domain": line.datamodule.hparams["domain"],
+        "configuration": json.loads(json.dumps(configured, default=str)),
+    }
 
 
 @functools.cache
@@ -133,12 +111,54 @@ def _model_hash(model: Any) -> str:
     return str(model.hash)
 
 
-def _reference_hash(hashing: ModuleType, configured: Mapping[str, Any]) -> str:
-    """Hash of reference lines; before hashes had a version it was made as below."""
-    if hasattr(hashing, "reference_hash"):
-        return str(hashing.reference_hash(configured))
-    shared = [hashing.__version__, configured["evaluation/samples"], configured["evaluation/sample_seed"]]
-    return str(hashing.content_hash(shared + ([configured["environment"]] if "environment" in configured else [])))
+def version_1(cell: Mapping[str, Any]) -> dict[str, str]:
+    """Hashes of version 1, which left out options that had been added later and had neutral values."""
+    inversion = InversionSettings()
+    neutral = dict.fromkeys(f"model/{name}" for name in INVERSION) | {
+        "model/modes": 1,
+        "model/mode_samples": 8,
+        "model/knots": 1,
+        "model/guidance_scale": 1.0,
+        "model/adapter": 0,
+        "model/adapter_learning_rate": 1e-3,
+        "model/adapter_scope": "concept",
+        "model/form": "",
+        "model/start": inversion.embeddings.start,
+        "model/screening": inversion.budget.screening,
+        "model/precision": inversion.budget.precision,
+        "data/demonstrations": None,
+        "evaluation/replan": None,
+        "evaluation/environments": [],
+        "environment": "",
+    }
+    known = {key: value for key, value in cell["configuration"].items() if key not in neutral or value != neutral[key]}
+    for key in ("domain", "method"):
+        del known[key]
+    shared = [known[key] for key in ("evaluation/samples", "evaluation/sample_seed", "environment") if key in known]
+    return {
+        HASH: content_hash([__version__, known | {"data/domain": cell["data/domain"]}]),
+        "reference_hash": content_hash([__version__, *shared]),
+    }
+
+
+def version_2(cell: Mapping[str, Any]) -> dict[str, str]:
+    """Hashes by the code that described the cell."""
+    return {HASH: config_hash(cell["configuration"]), "reference_hash": reference_hash(cell["configuration"])}
+
+
+def expanded(cells: Iterable[Mapping[str, Any]]) -> Iterator[dict[str, Any]]:
+    """Cells of all seeds; a cell without its pretrained model with each model in the plan's results."""
+    for cell in cells:
+        domain, file = cell["configuration"]["domain"], Path(cell["results"])
+        models = {cell["configuration"]["model/pretrained"]}
+        if cell["missing"] and file.is_file():
+            models |= {row["model_hash"] for row in _rows(file) if row["domain"] == domain and row["model_hash"]}
+        for seed in cell["seeds"]:
+            seeds = dict.fromkeys(("model/seed", "data/seed", "evaluation/sample_seed"), seed)
+            for model in sorted(models):
+                configured = cell["configuration"] | seeds | {"model/pretrained": model}
+                columns = {"domain": domain, "method": configured["method"], "seed": seed, "model_hash": model}
+                yield {**cell, **columns, "configuration": configured}
 
 
 def _rows(file: Path) -> list[dict[str, str]]:
@@ -150,11 +170,11 @@ class Cells:
     """New hashes by old hash, and by the columns of a row.
 
     Args:
-        before: cells described by the code before the change.
-        after: cells described by the code after the change.
+        before: cells before the change, with their hashes.
+        after: the cells after the change, with their hashes.
     """
 
-    def __init__(self, before: Sequence[Mapping[str, Any]], after: Sequence[Mapping[str, Any]]) -> None:
+    def __init__(self, before: Iterable[Mapping[str, Any]], after: Sequence[Mapping[str, Any]]) -> None:
         new = {_identity(cell): cell for cell in after}
         pairs = [(old, new[_identity(old)]) for old in before if _identity(old) in new]
         self.new = {old[HASH]: cell[HASH] for old, cell in pairs}
@@ -170,38 +190,57 @@ class Cells:
             file: results file.
             rows: rows of the method.
         """
-        tasks = {(row["setting"], row["task"]) for row in rows}
-        count, learned = {int(row["n"]) for row in rows}, {int(row["demonstrations"]) for row in rows} - {0}
+        tasks = {(row["setting"], row["task"]) for row in rows if row["setting"] != OWN}
+        samples, learned = max(int(row["n"]) for row in rows), {int(row["demonstrations"]) for row in rows} - {0}
         return {
             cell[HASH]
             for cell in self.after
             if cell["results"] == file
             and all(str(cell[column]) == rows[0][column] for column in SAME)
-            and count == {cell["samples"]}
-            and (not learned or min(learned) == cell["demonstrations"])
-            and tasks <= _tasks(cell["domain"], cell["suites"])
+            and _variant(cell, rows[0]["variant"])
+            and samples == cell["configuration"]["evaluation/samples"]
+            and (not learned or min(learned) == cell["configuration"]["data/demonstrations_per_concept"])
+            and tasks <= _tasks(cell["domain"], cell["configuration"]["evaluation/suites"])
         }
 
 
+def _variant(cell: Mapping[str, Any], variant: str) -> bool:
+    """Whether a row's variant is that of a cell, whose own model has other traits than the model that stands in for it."""
+    trait = TRAITS.get(cell["plan"])
+    if trait not in cell["cell"].split(", "):
+        return bool(variant == cell["variant"])
+    first, *_, last = variant.split(", ")
+    return first == trait and cell["variant"].endswith(last)
+
+
 def _identity(cell: Mapping[str, Any]) -> tuple[Any, ...]:
-    return (cell["plan"], cell["stage"], cell["cell"], cell["model_hash"])
+    return (cell["plan"], cell["stage"], cell["cell"], cell["seed"], cell["model_hash"])
 
 
 @functools.cache
 def _tasks(domain: str, suites: str) -> set[tuple[str, str]]:
     """Settings and tasks of suites."""
-    known = module("ftl_lightning.domains.registry").load_domain(domain).concepts.suites
+    known = load_domain(domain).concepts.suites
     return {(task.setting, task.name) for name in suites.split(", ") if name for task in known[name].tasks}
 
 
-def rewrite(before: Path, after: Path, files: Sequence[str]) -> None:
+def rewrite(after: Sequence[Path], files: Sequence[str], before: Path | None = None) -> None:
     """Rewrite the hashes in results files and films, and print what belongs to no cell."""
-    cells = Cells(json.loads(before.read_text("utf-8")), json.loads(after.read_text("utf-8")))
+    new = [cell | version_2(cell) for path in after for cell in expanded(json.loads(path.read_text("utf-8")))]
+    old = [cell | version_1(cell) for cell in new]
+    if before is not None:
+        old = [cell | version_2(cell) for cell in expanded(json.loads(before.read_text("utf-8")))]
+    cells = Cells(old, new)
     for name in files:
         path = Path(name)
         text = path.read_bytes().decode()
         if path.suffix == ".json":
-            changed = re.sub(r'("config_hash": ")(\w+)"', lambda match: f'{match[1]}{cells.new.get(match[2], match[2])}"', text)
+            known = cells.new | {
+                old: new for (domain, old), new in cells.references.items() if domain == json.loads(text)["domain"]
+            }
+            changed = re.sub(
+                r'("config_hash": ")(\w+)"', lambda match, known=known: f'{match[1]}{known.get(match[2], match[2])}"', text
+            )
             path.write_bytes(changed.encode())
             continue
         rows = _rows(path)
@@ -250,13 +289,13 @@ def main() -> None:
     describing.add_argument("--out", type=Path, required=True)
     rewriting = verbs.add_parser("rewrite")
     rewriting.add_argument("files", nargs="+")
-    rewriting.add_argument("--before", type=Path, required=True)
-    rewriting.add_argument("--after", type=Path, required=True)
+    rewriting.add_argument("--before", type=Path)
+    rewriting.add_argument("--after", type=Path, nargs="+", required=True)
     options = parser.parse_args()
     if options.verb == "describe":
         describe(options.plans, options.out)
     else:
-        rewrite(options.before, options.after, options.files)
+        rewrite(options.after, options.files, options.before)
 
 
 if __name__ == "__main__":

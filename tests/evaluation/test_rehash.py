@@ -12,15 +12,18 @@ from tests.conftest import ROOT
 from tests.evaluation.rows import REFERENCE
 from tests.evaluation.rows import row as usual_row
 
-PLACE = {"plan": "p.yaml", "results": "r.csv", "stage": 1, "domain": "object_rearrangement", "method": "FTL-IGM", "form": ""}
-PLACE |= {
-    "variant": "free",
-    "K": 2,
-    "omega": "1.2",
-    "model_hash": "m",
-    "samples": 50,
-    "suites": "training, paper",
-    "demonstrations": 5,
+CELL: dict[str, Any] = {"plan": "p.yaml", "results": "r.csv", "stage": 1, "cell": "c", "seeds": [0, 1], "missing": False}
+CELL |= {"form": "", "variant": "free", "K": 2, "omega": "1.2", "data/domain": "object_rearrangement"}
+CONFIGURATION = {
+    "domain": "object_rearrangement",
+    "method": "FTL-IGM",
+    "model/pretrained": "m",
+    "model/knots": 1,
+    "data/demonstrations_per_concept": 5,
+    "evaluation/samples": 50,
+    "evaluation/suites": "training, paper",
+    "evaluation/replan": None,
+    "environment": "",
 }
 TASK = {"setting": "new concept", "task": "square diagonal to triangle"}
 
@@ -29,20 +32,14 @@ def script(name: str) -> dict[str, Any]:
     return runpy.run_path(str(ROOT / "benchmarks" / "making" / f"{name}.py"))
 
 
-def cells(*hashes: str) -> list[dict[str, Any]]:
-    """Cells of the seeds 0, 1 and so on."""
-    pairs = enumerate(hashes)
-    return [
-        {**PLACE, "cell": f"c{seed}", "seed": seed, "config_hash": text, "reference_hash": f"{text[:2]}r"} for seed, text in pairs
-    ]
-
-
 def rows() -> list[Row]:
+    described = CELL | {"configuration": CONFIGURATION | dict.fromkeys(("model/seed", "data/seed", "evaluation/sample_seed"), 0)}
+    before = script("rehash")["version_1"](described)
     return [
-        usual_row(**TASK, seed=0, config_hash="o0"),
+        usual_row(**TASK, seed=0, config_hash=before["config_hash"]),
         usual_row(**TASK, seed=1, config_hash="stale"),
         usual_row(**TASK, seed=2, config_hash="unplanned"),
-        usual_row(**TASK | REFERENCE, seed=0, config_hash="o0r", method="chance"),
+        usual_row(**TASK | REFERENCE, seed=0, config_hash=before["reference_hash"], method="chance"),
     ]
 
 
@@ -51,14 +48,15 @@ def test_hashes_are_rewritten_by_the_hash_before_or_the_columns_of_a_row_and_not
 ) -> None:
     append_rows("r.csv", rows())
     known = read_rows("r.csv")
-    Path("film.json").write_text('{"row": {"config_hash": "o0", "value": 1.0}}')
-    for name, hashes in (("before", ("o0", "o1")), ("after", ("2:0", "2:1"))):
-        Path(f"{name}.json").write_text(json.dumps(cells(*hashes)))
-    script("rehash")["rewrite"](Path("before.json"), Path("after.json"), ["r.csv", "film.json"])
+    Path("film.json").write_text(json.dumps({"domain": "d", "row": {"config_hash": known["config_hash"][0], "value": 1.0}}))
+    Path("cells.json").write_text(json.dumps([CELL | {"configuration": CONFIGURATION}]))
+    script("rehash")["rewrite"]([Path("cells.json")], ["r.csv", "film.json"])
     table = read_rows("r.csv")
-    assert table["config_hash"].tolist() == ["2:0", "2:1", "unplanned", "2:r"]
+    hashes = table["config_hash"].tolist()
+    assert [text[:2] for text in hashes] == ["2:", "2:", "un", "2:"]
+    assert len(set(hashes)) == 4
     assert table.drop(columns="config_hash").equals(known.drop(columns="config_hash"))
-    assert Path("film.json").read_text() == '{"row": {"config_hash": "2:0", "value": 1.0}}'
+    assert json.loads(Path("film.json").read_text()) == {"domain": "d", "row": {"config_hash": hashes[0], "value": 1.0}}
     printed = capsys.readouterr().out
     assert "unplanned (1 rows, 0 cells)" in printed
     assert "r.csv: 4 rows: 2 same hash before, 1 same columns, 1 0 cells" in printed
@@ -66,7 +64,7 @@ def test_hashes_are_rewritten_by_the_hash_before_or_the_columns_of_a_row_and_not
 
 def test_a_cell_that_was_run_again_is_compared_to_the_last_digit() -> None:
     rerun = script("rerun_cells")
-    (results, cell), *_ = rerun["cells_of"](str(ROOT / "conf/ablation/tabletop.yaml"), r"invert tabletop, seed 0", "")
+    (_results, cell), *_ = rerun["cells_of"](str(ROOT / "conf/ablation/tabletop.yaml"), r"invert tabletop, seed 0", "")
     assert "model.pretrained" not in cell.options
     append_rows("r.csv", rows()[:2])
     append_rows(Path("again", f"r_{cell.folder}", "results.csv"), rows()[:2])
