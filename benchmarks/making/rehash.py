@@ -235,13 +235,7 @@ def rewrite(after: Sequence[Path], files: Sequence[str], before: Path | None = N
         path = Path(name)
         text = path.read_bytes().decode()
         if path.suffix == ".json":
-            known = cells.new | {
-                old: new for (domain, old), new in cells.references.items() if domain == json.loads(text)["domain"]
-            }
-            changed = re.sub(
-                r'("config_hash": ")(\w+)"', lambda match, known=known: f'{match[1]}{known.get(match[2], match[2])}"', text
-            )
-            path.write_bytes(changed.encode())
+            path.write_bytes(_films(cells, text).encode())
             continue
         rows = _rows(path)
         hashes = _new_hashes(cells, name, rows)
@@ -252,6 +246,13 @@ def rewrite(after: Sequence[Path], files: Sequence[str], before: Path | None = N
             assert old == row[HASH], "the hash is in the last column but one"
             lines[number] = ",".join((head, hashes.get((row["domain"], row["role"], old), old), tail))
         path.write_bytes("".join(lines).encode())
+
+
+def _films(cells: Cells, text: str) -> str:
+    """Content of a file of films with new hashes."""
+    film_domain = json.loads(text)["domain"]
+    known = cells.new | {old: new for (domain, old), new in cells.references.items() if domain == film_domain}
+    return re.sub(r'("config_hash": ")([\w:]+)"', lambda match: f'{match[1]}{known.get(match[2], match[2])}"', text)
 
 
 def _new_hashes(cells: Cells, name: str, rows: Sequence[Mapping[str, str]]) -> dict[tuple[str, str, str], str]:
