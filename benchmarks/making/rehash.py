@@ -37,6 +37,7 @@ from ftl_lightning.services import log_folder
 from ftl_lightning.services.tensor_file import content_hash
 from ftl_lightning.training import adaptation, data
 from ftl_lightning.training.inversion_settings import INVERSION, InversionSettings
+from ftl_lightning.training.pretrained import load_model
 from ftl_lightning.version import __version__
 
 PLANS = [
@@ -73,7 +74,7 @@ def describe(plans: Sequence[str], out: Path) -> None:
     with (
         patch.object(data.InversionData, "_drawn", lambda *_: SimpleNamespace(concepts=())),
         patch.object(language, "load_encoder", lambda *_: SimpleNamespace(identity=AnyText())),
-        patch.object(adaptation, "load_model", functools.cache(adaptation.load_model)),
+        patch.object(adaptation, "load_model", functools.cache(load_model)),
     ):
         for plan in plans:
             content = yaml.safe_load(Path(plan).read_text("utf-8"))
@@ -91,7 +92,7 @@ def _described(cell: Cell) -> dict[str, Any]:
     missing = [text for text in cell.arguments if text.startswith(option) and not Path(text.removeprefix(option)).is_dir()]
     with log_folder.run():
         line = build(cell.verb, [text for text in cell.arguments if text not in missing] + _log(cell))
-    evaluator = next(callback for callback in line.trainer.callbacks if isinstance(callback, Evaluator))
+    evaluator = next(callback for callback in line.trainer.callbacks if isinstance(callback, Evaluator))  # type: ignore[attr-defined]
     learner, hparams = line.model, line.model.hparams
     with patch.object(type(learner.model), "hash", _model_hash(learner.model)):
         configured = configuration(learner, line.datamodule, evaluator.settings(line.datamodule), line.trainer)
@@ -227,10 +228,10 @@ def _tasks(domain: str, suites: str) -> set[tuple[str, str]]:
 def rewrite(after: Sequence[Path], files: Sequence[str], before: Path | None = None) -> None:
     """Rewrite the hashes in results files and films, and print what belongs to no cell."""
     new = [cell | version_2(cell) for path in after for cell in expanded(json.loads(path.read_text("utf-8")))]
-    old = [cell | version_1(cell) for cell in new]
+    known = [cell | version_1(cell) for cell in new]
     if before is not None:
-        old = [cell | version_2(cell) for cell in expanded(json.loads(before.read_text("utf-8")))]
-    cells = Cells(old, new)
+        known = [cell | version_2(cell) for cell in expanded(json.loads(before.read_text("utf-8")))]
+    cells = Cells(known, new)
     for name in files:
         path = Path(name)
         text = path.read_bytes().decode()

@@ -24,6 +24,7 @@ import yaml
 
 from ftl_lightning.apps.ablation.plan import Cell, Stage
 from ftl_lightning.apps.ablation.run import planned
+from ftl_lightning.evaluation.results import METHOD
 
 CELLS = {
     "conf/ablation/comparison.yaml": r"invert (object_rearrangement|agent), .*seed \d|invert driving, .*seed 0",
@@ -36,6 +37,7 @@ CELLS = {
 """Patterns of the names of cells by plan: all five domains and all methods."""
 KEY = ("domain", "setting", "task", "method", "form", "variant", "role", "K", "omega", "demonstrations", "seed", "n", "metric")
 """Columns that identify a row beside its hash."""
+ROLE = KEY.index("role")
 
 
 def cells_of(plan: str, pattern: str, root: str) -> Iterator[tuple[str, Cell]]:
@@ -75,15 +77,18 @@ def run(results: str, cell: Cell, folder: Path) -> dict[str, object]:
             return {"cell": cell.name, "results": results, "state": "failed", "output": str(place / "output.txt")}
         running.replace(measured)
     known, values = read(Path(results)), read(measured)
-    differ = {key: (known[key], value) for key, value in values.items() if key in known and known[key] != value}
-    unknown = [key for key in values if key not in known]
+    (own,) = {key[-1] for key in values if key[ROLE] == METHOD}
+    compared = [key for key in values if key in known]
+    differ = [key for key in compared if known[key] != values[key]]
+    missing = [key for key in known if key[-1] == own and key not in values]
     return {
         "cell": cell.name,
         "results": results,
-        "state": "unknown rows" if unknown else "differs" if differ else "equal",
-        "values": len(values),
-        "different": [{"row": ", ".join(key), "committed": old, "again": new} for key, (old, new) in differ.items()],
-        "unknown": [", ".join(key) for key in unknown],
+        "state": "missing rows" if missing or not compared else "differs" if differ else "equal",
+        "compared": len(compared),
+        "not committed": len(values) - len(compared),  # such as metrics that are newer than the row
+        "different": [{"row": ", ".join(key), "committed": known[key], "again": values[key]} for key in differ],
+        "missing": [", ".join(key) for key in missing],
         "seconds": round(time.monotonic() - begun, 1),
     }
 

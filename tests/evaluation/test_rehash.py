@@ -67,12 +67,15 @@ def test_a_cell_that_was_run_again_is_compared_to_the_last_digit() -> None:
     rerun = script("rerun_cells")
     (_results, cell), *_ = rerun["cells_of"](str(ROOT / "conf/ablation/tabletop.yaml"), r"invert tabletop, seed 0", "")
     assert "model.pretrained" not in cell.options
-    append_rows("r.csv", rows()[:2])
-    append_rows(Path("again", f"r_{cell.folder}", "results.csv"), rows()[:2])
-    assert rerun["run"]("r.csv", cell, Path("again"))["state"] == "equal"
-    append_rows("r.csv", [replace(rows()[0], value=0.25)])
+    again = Path("again", f"r_{cell.folder}", "results.csv")
+    committed, *_, chance = rows()
+    append_rows("r.csv", [committed, chance])
+    append_rows(again, [committed, chance, replace(committed, metric="newer")])
+    outcome = rerun["run"]("r.csv", cell, Path("again"))
+    assert (outcome["state"], outcome["compared"], outcome["not committed"]) == ("equal", 2, 1)
+    append_rows("r.csv", [replace(committed, value=0.25)])
     outcome = rerun["run"]("r.csv", cell, Path("again"))
     assert outcome["state"] == "differs"
     assert [(change["committed"], change["again"]) for change in outcome["different"]] == [("0.25", "0.5")]
-    append_rows(Path("again", f"r_{cell.folder}", "results.csv"), [usual_row(**TASK, seed=5)])
-    assert rerun["run"]("r.csv", cell, Path("again"))["state"] == "unknown rows"
+    append_rows("r.csv", [replace(committed, metric="older")])
+    assert rerun["run"]("r.csv", cell, Path("again"))["state"] == "missing rows"
