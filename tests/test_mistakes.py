@@ -35,9 +35,8 @@ from ftl_lightning.methods.ftl_igm.codes import Codes
 from ftl_lightning.methods.ftl_igm.pretraining import LossOptions, PretrainingModule
 from ftl_lightning.services.errors import LONGEST, UserError
 from ftl_lightning.training.checkpoint import WholeCheckpoints
-from ftl_lightning.training.data import InversionData
+from ftl_lightning.training.data import InversionData, PretrainingData
 from ftl_lightning.training.inversion_module import InversionModule
-from ftl_lightning.training.rearrangement_datamodule import ObjectRearrangementData
 from ftl_lightning.training.trainer import Trainer
 
 from .conftest import CONF, ROOT, TINY, refused
@@ -75,7 +74,8 @@ def refusal(*expected: str) -> Iterator[pytest.ExceptionInfo[UserError]]:
 CLASSES = {
     "fit": [
         "--model=ftl_lightning.methods.ftl_igm.pretraining.PretrainingModule",
-        "--data=ftl_lightning.training.rearrangement_datamodule.ObjectRearrangementData",
+        "--data=ftl_lightning.training.data.PretrainingData",
+        "--data.domain=object_rearrangement",
     ],
     "invert": [
         "--model=ftl_lightning.training.inversion_module.InversionModule",
@@ -131,13 +131,16 @@ def a_trainer(**options: Any) -> Trainer:
     return Trainer(**{"accelerator": "cpu", "logger": False, "enable_progress_bar": False} | options)
 
 
+def scenes(**options: Any) -> PretrainingData:
+    return PretrainingData(**{"domain": "object_rearrangement"} | options)
+
+
 def drawn(**options: Any) -> InversionData:
     return InversionData(**{"domain": "object_rearrangement"} | options)
 
 
 SHARE = "trainer.{}: expected a share from 0 to 1 or a whole number of "
 INITIAL = "denoiser_args.initial_encoder: expected one of flat, joint, entities, set"
-SCENE = "data.{}: expected 'object_rearrangement' or none for ObjectRearrangementData"
 OUT_OF_RANGE: Sequence[tuple[Callable[..., object], str, Mapping[str, Sequence[object]]]] = [
     (a_trainer, "trainer: You selected an invalid {} name: `{}='foo'`", {"accelerator": ["foo"]}),
     (a_trainer, "trainer: ", {"max_time": ["foo"]} | ({} if torch.cuda.is_available() else {"accelerator": ["cuda"]})),
@@ -174,13 +177,13 @@ OUT_OF_RANGE: Sequence[tuple[Callable[..., object], str, Mapping[str, Sequence[o
     (settings.LossOptions, "model.loss.{}: expected 1 or more", {"timestep_power": [0.5]}),
     (settings.LossOptions, "model.loss.{}: expected a number from 1 to 100", {"timestep_power": [1e9]}),
     (settings.LossOptions, "model.loss.{}: expected one of epsilon, v, clean, found 'foo'", {"kind": ["foo"]}),
-    (ObjectRearrangementData, SCENE, {"domain": ["chess", "../../x"]}),
-    (ObjectRearrangementData, "data.{}: expected a number from 1", {"start_exponent": [1e38]}),
-    (ObjectRearrangementData, "data.{}: expected 0 or more", {"seed": [-1]}),
+    (scenes, "domain", {"domain": ["chess", "../../x"]}),
+    (scenes, "data.{}: expected a number from 1", {"start_exponent": [1e38]}),
+    (scenes, "data.{}: expected 0 or more", {"seed": [-1]}),
     (drawn, "data.{}: expected one of training, paper", {"suite": ["foo"]}),
     (drawn, "data.{}: expected a suite that learns concepts", {"suite": ["training"]}),
     (drawn, "{}: expected one of", {"domain": ["chess"]}),
-    (drawn, "data.{}, data.demonstrations_per_concept: expected 1 or more", {"steps": [0, -1]}),
+    (drawn, "data.{}: expected 1 or more", {"steps": [0, -1], "demonstrations_per_concept": [0]}),
     (drawn, "data.{}: expected 0 or more", {"seed": [-1]}),
     (Evaluator, "evaluation.{}: expected one of ddpm, ddim, dpm_solver, found 'foo'", {"sampler": ["foo"]}),
     (Evaluator, "evaluation.{}: expected a number from 0 to 1e+06", {"temperature": [1e38]}),
@@ -248,8 +251,8 @@ def begun(module: pl.LightningModule, data: pl.LightningDataModule) -> None:
 
 
 @pytest.fixture(scope="module")
-def scenes() -> ObjectRearrangementData:
-    data = ObjectRearrangementData(samples_per_concept=2, validation_per_concept=1)
+def few_scenes() -> PretrainingData:
+    data = scenes(samples_per_concept=2, validation_per_concept=1)
     data.setup("fit")
     return data
 
@@ -272,10 +275,10 @@ def scenes() -> ObjectRearrangementData:
     ],
     ids=str,
 )
-def test_networks_that_are_not_built(options: dict[str, Any], expected: str, scenes: ObjectRearrangementData) -> None:
+def test_networks_that_are_not_built(options: dict[str, Any], expected: str, few_scenes: PretrainingData) -> None:
     small = {"hidden_dim": 8, "depth": 1, "condition_dim": 8} | options.get("denoiser_args", {})
     with refusal(expected):
-        begun(PretrainingModule(**options | {"denoiser_args": small}), scenes)
+        begun(PretrainingModule(**options | {"denoiser_args": small}), few_scenes)
 
 
 def test_what_the_pretrained_model_or_its_domain_does_not_have() -> None:

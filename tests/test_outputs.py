@@ -24,8 +24,7 @@ from ftl_lightning.apps.study.report import read_key
 from ftl_lightning.cli.main import main
 from ftl_lightning.domains.pictures import line_drawings
 from ftl_lightning.evaluation.pictures import captioned
-from ftl_lightning.evaluation.results import append_rows, read_rows
-from ftl_lightning.evaluation.row import Row
+from ftl_lightning.evaluation.results import Row, append_rows, read_rows
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.reporting import report
 from ftl_lightning.reporting.figures import accuracy_bars

@@ -43,7 +43,8 @@ def line_of(verb: str, *arguments: str) -> str:
 def test_a_mistake_in_a_file_of_one_s_own_is_told_with_its_line(
     text: str, line: int, expected: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    Path("data.yaml").write_text("data: {class_path: ftl_lightning.training.rearrangement_datamodule.ObjectRearrangementData}\n")
+    data = "{class_path: ftl_lightning.training.data.PretrainingData, init_args: {domain: object_rearrangement}}"
+    Path("data.yaml").write_text(f"data: {data}\n")
     Path("own.yaml").write_text(f"defaults: [conf/method/ftl_igm.yaml, data.yaml]\n{text}\n")
     refused(capsys, ["fit", "--config=own.yaml"], f"error: own.yaml: line {line}: ", expected)
 

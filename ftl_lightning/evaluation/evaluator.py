@@ -12,12 +12,11 @@ from lightning.pytorch.loggers import TensorBoardLogger
 
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.tasks import EvaluationTask
-from ftl_lightning.evaluation.chosen import chosen
 from ftl_lightning.evaluation.generation import Evaluable, Generation, TaskResult, evaluable, execute, generate, tasks_of
 from ftl_lightning.evaluation.pictures import write_films
-from ftl_lightning.evaluation.record import record
 from ftl_lightning.evaluation.references import lines, real_behaviour, references
-from ftl_lightning.evaluation.rows import config_hash, configuration, rows
+from ftl_lightning.evaluation.results import config_hash, configuration, rows
+from ftl_lightning.evaluation.summary import hparams_of, record
 from ftl_lightning.evaluation.tensorboard import draw, log_projector, log_test, own_rows, setting_means
 from ftl_lightning.services.errors import require, shown
 from ftl_lightning.services.text import say
@@ -91,8 +90,8 @@ class Evaluator(pl.Callback):
             "steps": generation.steps,
             "temperature": generation.temperature,
             "sample_seed": generation.seed,
-            **({"replan": generation.replan} if self.closed_loop else {}),
-            **({"environments": list(generation.environments)} if generation.environments else {}),
+            "replan": generation.replan if self.closed_loop else None,
+            "environments": list(generation.environments),
         }
 
     def config_hash(self, module: Evaluable, data: pl.LightningDataModule, trainer: pl.Trainer) -> str:
@@ -151,7 +150,7 @@ class Evaluator(pl.Callback):
             say(f"{self.films}: {count} films")
         self._draw(trainer, module)
         if method_rows := own_rows(measured):
-            hparams = chosen(module, data, settings, trainer, method_rows)
+            hparams = hparams_of(module, data, settings, trainer, method_rows)
             for logger in _boards(trainer):
                 log_test(logger, hparams, measured, trainer.global_step)
 

@@ -18,7 +18,7 @@ from torch import Tensor
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.films import VectorFilm, Wireframe, of_wireframe
 from ftl_lightning.evaluation.generation import TaskResult
-from ftl_lightning.evaluation.row import METHOD, Row
+from ftl_lightning.evaluation.results import METHOD, Row
 from ftl_lightning.services.tensor_file import write_text
 from ftl_lightning.services.text import line
 

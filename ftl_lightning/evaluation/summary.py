@@ -1,8 +1,10 @@
-"""Summary table of an evaluation for the terminal."""
+"""Summary of an evaluation for the terminal and TensorBoard."""
 
 import io
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from rich import box
 from rich.console import Console
@@ -10,11 +12,78 @@ from rich.table import Table
 from rich.text import Text
 
 from ftl_lightning.domains.domain import COVERAGE, NOVELTY
-from ftl_lightning.evaluation.generation import LOST, OWN, WON, standard_error
-from ftl_lightning.evaluation.row import METHOD, REFERENCE, Row, label
+from ftl_lightning.evaluation.generation import LOST, OWN, WON, Evaluable, standard_error
+from ftl_lightning.evaluation.results import METHOD, REFERENCE, Row, append_rows, label, public
+from ftl_lightning.services.errors import short
 from ftl_lightning.services.text import line, markdown, say
 
+if TYPE_CHECKING:
+    import lightning.pytorch as pl
+
 DIVERSITY = (NOVELTY, COVERAGE)
+LONGEST_TASKS = 100
+"""Maximum length of the list of tasks in the HPARAMS tab."""
+NAMED = ("model/components", "model/omega", "model/guidance", "model/seed", "model/form", "data/domain", "data/seed", "data/steps")
+"""Options with a named column in the HPARAMS tab."""
+
+
+def record(rows: Sequence[Row], results: str | None, folder: str | Path) -> None:
+    """Add rows to the results file and show their summary.
+
+    Args:
+        rows: rows of an evaluation; if empty, nothing is written or shown.
+        results: results file; ``None`` for ``results.csv`` in ``folder``, whose path is then printed.
+        folder: log folder of the run.
+
+    Raises:
+        UserError: for an invalid results file or a write error.
+    """
+    if not rows:
+        return
+    path = results or Path(folder) / "results.csv"
+    append_rows(path, rows)
+    show(summary_table(rows, [row.task for row in rows if row.setting == OWN]))
+    if results is None:
+        say(f"{path}: {len(rows)} rows")
+
+
+def hparams_of(
+    module: Evaluable, data: "pl.LightningDataModule", settings: Mapping[str, Any], trainer: "pl.Trainer", rows: Sequence[Row]
+) -> dict[str, Any]:
+    """Columns of the HPARAMS tab, without hashes.
+
+    Columns of other options begin with "with", as TensorBoard shows the first five by name.
+
+    Args:
+        module: evaluated module.
+        data: training or test data.
+        settings: settings of the evaluator.
+        trainer: trainer.
+        rows: rows of the method, at least one.
+    """
+    first = rows[0]
+    groups = {"model": public(module.hparams), "data": public(data.hparams), "evaluation": settings}
+    groups["trainer"] = getattr(trainer, "unusual", {})
+    options = {f"{group}/{key}": value for group, values in groups.items() for key, value in values.items()}
+    return {
+        "domain": first.domain,
+        "method": first.method,
+        "K": first.K,
+        "omega": _number(first.omega),
+        "form": first.form or "usual",
+        "seed": first.seed,
+        "steps": data.hparams.get("steps", trainer.max_steps),
+        "tasks": short(", ".join(dict.fromkeys(row.task for row in rows)), LONGEST_TASKS),
+        "variant": first.variant,
+        **{f"with {name}": value for name, value in options.items() if name not in NAMED},
+    }
+
+
+def _number(text: str) -> float | str:
+    try:
+        return float(text)
+    except ValueError:
+        return text
 
 
 def summary_table(rows: Sequence[Row], single: Sequence[str] = ()) -> Table:
@@ -24,7 +93,7 @@ def summary_table(rows: Sequence[Row], single: Sequence[str] = ()) -> Table:
     column n is the number of tasks x samples per task.
 
     Args:
-        rows: rows of an evaluation, see :func:`ftl_lightning.evaluation.rows.rows`.
+        rows: rows of an evaluation, see :func:`ftl_lightning.evaluation.results.rows`.
         single: names of tasks with a separate line, for example the concepts of user demonstrations.
     """
     measured = [row for row in rows if row.role == METHOD and not row.metric.startswith((WON, LOST))]

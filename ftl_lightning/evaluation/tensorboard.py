@@ -22,7 +22,7 @@ from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.pictures import Drawn, beside
 from ftl_lightning.evaluation.generation import LOST, WON, TaskResult, share
 from ftl_lightning.evaluation.pictures import captioned, gif, outcome_text
-from ftl_lightning.evaluation.row import METHOD, Row
+from ftl_lightning.evaluation.results import METHOD, Row
 from ftl_lightning.evaluation.summary import plain, summary_table
 from ftl_lightning.igm.forms.quality import first_windows
 from ftl_lightning.igm.point import Part, Point
@@ -115,7 +115,7 @@ def own_rows(rows: Sequence[Row]) -> list[Row]:
     """Rows of the method without reference lines and paired comparisons.
 
     Args:
-        rows: see :func:`ftl_lightning.evaluation.rows.rows`.
+        rows: see :func:`ftl_lightning.evaluation.results.rows`.
     """
     return [row for row in rows if row.role == METHOD and not row.metric.startswith((WON, LOST))]
 
@@ -126,7 +126,7 @@ def log_test(logger: TensorBoardLogger, settings: Mapping[str, Any], rows: Seque
 
     Args:
         logger: output.
-        settings: see :func:`ftl_lightning.evaluation.chosen.chosen`.
+        settings: see :func:`ftl_lightning.evaluation.summary.hparams_of`.
         rows: rows of the method and of reference lines.
         step: global step.
     """

@@ -7,8 +7,7 @@ import pandas as pd
 
 from ftl_lightning.domains.comparison import CHOSEN, FINE_TUNED, OURS, PAPERS_METHOD, WITH_MODES, Compared
 from ftl_lightning.domains.domain import Domain
-from ftl_lightning.evaluation.results import latest
-from ftl_lightning.evaluation.row import METHOD, REFERENCE, label
+from ftl_lightning.evaluation.results import METHOD, REFERENCE, label, latest
 from ftl_lightning.reporting.paired import Lead, leads, least_certain, same_outcome, signed
 from ftl_lightning.reporting.table import (
     MISSING,

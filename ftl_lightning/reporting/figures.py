@@ -11,9 +11,8 @@ from matplotlib.lines import Line2D
 from ftl_lightning.domains.comparison import CHOSEN, FINE_TUNED, OURS, PAPERS_METHOD, WITH_ADAPTER, WITH_KNOTS, WITH_MODES, Compared
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.evaluation.references import FRESH, REPLAYED
-from ftl_lightning.evaluation.results import latest
-from ftl_lightning.evaluation.row import REFERENCE
-from ftl_lightning.evaluation.row import label as method_label
+from ftl_lightning.evaluation.results import REFERENCE, latest
+from ftl_lightning.evaluation.results import label as method_label
 from ftl_lightning.reporting.comparison import compared, methods, reference_lines, shown_lines
 from ftl_lightning.reporting.measurements import NOISY, Measured, reached
 from ftl_lightning.reporting.table import lookup, main_omega, of_method, select, settings, summarise

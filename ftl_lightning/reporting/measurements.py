@@ -15,7 +15,7 @@ import pandas as pd
 
 from ftl_lightning.domains.comparison import PAPERS_METHOD
 from ftl_lightning.domains.domain import Domain
-from ftl_lightning.evaluation.row import label
+from ftl_lightning.evaluation.results import label
 from ftl_lightning.reporting.table import MISSING, Table, make_table, of_method, select
 from ftl_lightning.services.errors import UserError, shown
 from ftl_lightning.services.tensor_file import write_text

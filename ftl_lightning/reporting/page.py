@@ -13,8 +13,7 @@ import pandas as pd
 from ftl_lightning.domains.comparison import OURS, Compared
 from ftl_lightning.domains.domain import CLOSED, Domain
 from ftl_lightning.evaluation.pictures import FORMAT
-from ftl_lightning.evaluation.results import COMPARISON, CURVES, latest, read_rows, read_study
-from ftl_lightning.evaluation.row import METHOD, REFERENCE, label
+from ftl_lightning.evaluation.results import COMPARISON, CURVES, METHOD, REFERENCE, label, latest, read_rows, read_study
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.reporting.comparison import METHODS, all_methods, compared, methods, reference_lines, shown_lines
 from ftl_lightning.reporting.concept_figures import concept_places

@@ -9,7 +9,7 @@ import pandas as pd
 from scipy.stats import binom
 
 from ftl_lightning.domains.comparison import Compared
-from ftl_lightning.evaluation.row import label
+from ftl_lightning.evaluation.results import label
 
 LEVEL = 0.05
 """Significance level of p."""

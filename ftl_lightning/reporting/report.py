@@ -9,8 +9,7 @@ from matplotlib.figure import Figure
 
 from ftl_lightning.domains.comparison import OURS, PAPERS_METHOD
 from ftl_lightning.domains.domain import Domain
-from ftl_lightning.evaluation.results import CHANGES, COMPARISON, CURVES, read_rows, read_study, replaced
-from ftl_lightning.evaluation.row import METHOD
+from ftl_lightning.evaluation.results import CHANGES, COMPARISON, CURVES, METHOD, read_rows, read_study, replaced
 from ftl_lightning.reporting.comparison import (
     all_methods,
     compared,

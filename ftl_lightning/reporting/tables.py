@@ -10,8 +10,7 @@ import pandas as pd
 from ftl_lightning.domains.comparison import OURS, PAPERS_METHOD, Compared, Published
 from ftl_lightning.domains.domain import CLOSED, EXECUTED, Domain
 from ftl_lightning.evaluation.generation import LOST, WON
-from ftl_lightning.evaluation.results import LARGEST_WHOLE, labels, latest
-from ftl_lightning.evaluation.row import METHOD, REFERENCE
+from ftl_lightning.evaluation.results import LARGEST_WHOLE, METHOD, REFERENCE, labels, latest
 from ftl_lightning.reporting.paired import episodes
 from ftl_lightning.reporting.table import (
     MISSING,

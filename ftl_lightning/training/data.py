@@ -1,4 +1,4 @@
-"""DataModules for pretraining (subclassed by domains) and for inversion (shared by all domains).
+"""DataModules for pretraining and inversion, shared by all domains.
 
 Both deliver demonstrations in the domain's units; the model normalises them. Each batch depends only on the seed and the step
 number, so an interrupted and resumed run matches an uninterrupted run.
@@ -7,7 +7,7 @@ number, so an interrupted and resumed run matches an uninterrupted run.
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import lightning.pytorch as pl
 import torch
@@ -20,9 +20,9 @@ from ftl_lightning.domains.domain import Domain, Recoveries
 from ftl_lightning.domains.from_file import OWN, domain_from_file, read_demonstrations, read_own
 from ftl_lightning.domains.registry import load_domain, recorded_name
 from ftl_lightning.networks.text_encoder import Encoder, load_encoder
-from ftl_lightning.services.errors import UserError, short
+from ftl_lightning.services.errors import UserError, require, short
 from ftl_lightning.services.randomness import DEMONSTRATION_SEED, drawn, generator, rows_of
-from ftl_lightning.services.validation import LARGEST, LARGEST_STEP, MOST_TOGETHER, check_count, check_factor, check_range
+from ftl_lightning.services.validation import LARGEST_STEP, MOST_TOGETHER, check_count, check_factor, check_range
 
 
 class Batch(NamedTuple):
@@ -73,11 +73,10 @@ class Windows:
 
 
 class PretrainingData(pl.LightningDataModule):
-    """Batches of (behaviour, concept) pairs of a domain. A subclass may name the domain.
+    """Batches of (behaviour, concept) pairs of a domain.
 
     Args:
-        domain: name of the domain, or ``package.module:DOMAIN``, see :func:`ftl_lightning.domains.registry.load_domain`; empty
-            for the class's domain.
+        domain: name of the domain, or ``package.module:DOMAIN``, see :func:`ftl_lightning.domains.registry.load_domain`.
         root: folder of the user's copy of the data, for domains whose demonstrations do not ship.
         samples_per_concept: demonstrations of each training concept.
         validation_per_concept: validation demonstrations of each training concept.
@@ -96,12 +95,9 @@ class PretrainingData(pl.LightningDataModule):
         UserError: for an invalid value.
     """
 
-    own_domain: ClassVar[str] = ""
-    """Name of the class's domain."""
-
     def __init__(
         self,
-        domain: str = "",
+        domain: str,
         root: str | None = None,
         samples_per_concept: int = 100,
         validation_per_concept: int = 10,
@@ -117,35 +113,24 @@ class PretrainingData(pl.LightningDataModule):
         super().__init__()
         chosen = Windows(**windows)
         windows = asdict(chosen)  # hyper-parameters are the local variables: include defaults
-        # Leave out unset new keys, so that older configurations keep their hash.
-        unsaid = {"balance": chosen.balance is None, "recoveries": not recoveries, "more": more is None}
-        self.save_hyperparameters(ignore=[name for name, absent in unsaid.items() if absent])
-        if self.own_domain and domain not in ("", self.own_domain):
-            raise UserError(f"data.domain: expected {self.own_domain!r} or none for {type(self).__name__}, found {domain!r}")
-        self.domain_name, self.domain = self._domain(self.own_domain or domain)
+        self.save_hyperparameters()
+        self.domain_name, self.domain = self._domain(domain)
         self._number = {text: number for number, text in enumerate(self.domain.concepts.training)}
         self.metrics: Mapping[str, float] = {}
         plans = self.domain.plans
         self.horizon = plans.horizon if chosen.horizon is None else chosen.horizon
         self.start_exponent = plans.exponent(self.horizon) if chosen.start_exponent is None else chosen.start_exponent
-        if self.start_exponent < 1:
-            raise UserError(f"data.start_exponent: expected 1 or more, found {chosen.start_exponent}")
         check_factor("data.start_exponent", self.start_exponent, 1)
-        counts = {
-            "batch_size": (batch_size, MOST_TOGETHER),
-            "steps_per_epoch": (steps_per_epoch, LARGEST_STEP),
-            "horizon": (self.horizon, LARGEST),
-            "samples_per_concept": (samples_per_concept, LARGEST),
-            "validation_per_concept": (validation_per_concept, MOST_TOGETHER),
-        }
-        for name, (value, most) in counts.items():
-            check_count(f"data.{name}", value, 1, most)
+        check_count("data.batch_size", batch_size, 1, MOST_TOGETHER)
+        check_count("data.steps_per_epoch", steps_per_epoch, 1, LARGEST_STEP)
+        check_count("data.horizon", self.horizon, 1)
+        check_count("data.samples_per_concept", samples_per_concept, 1)
+        check_count("data.validation_per_concept", validation_per_concept, 1, MOST_TOGETHER)
+        check_count("data.recoveries", recoveries, 0)
         check_range("data.seed", seed, 0)
-        check_count("data.recoveries", recoveries, 0, LARGEST)
-        self.recoveries, self.more = recoveries, more
-        self.balance = chosen.balance
-        if self.balance is not None and not 0 <= self.balance <= 1:
-            raise UserError(f"data.balance: expected a number from 0 to 1, found {self.balance}")
+        if chosen.balance is not None:
+            check_range("data.balance", chosen.balance, 0, 1)
+        self.recoveries, self.more, self.balance = recoveries, more, chosen.balance
         self.root = None if root is None else Path(root)
         self.samples_per_concept = samples_per_concept
         self.validation_per_concept = validation_per_concept
@@ -179,8 +164,7 @@ class PretrainingData(pl.LightningDataModule):
     def _read_more(self, path: str) -> Demonstrations:
         demonstrations = read_demonstrations(path, self.domain)
         for text in demonstrations.concepts:
-            if text not in self._number:
-                raise UserError(f"{path}: expected demonstrations of training concepts, found {short(text)!r}")
+            require(text in self._number, path, "demonstrations of training concepts", repr(short(text)))
         return demonstrations
 
     @property
@@ -274,8 +258,7 @@ class OwnData(PretrainingData):
         horizon: int | None = None,
         start_exponent: float | None = None,
     ) -> None:
-        if not 0 < validation_share < 1:
-            raise UserError(f"data.validation_share: expected a share between 0 and 1, found {validation_share}")
+        require(0 < validation_share < 1, "data.validation_share", "a share between 0 and 1", validation_share)
         self._file, self._share, self._metrics, self._horizon = demonstrations, validation_share, dict(metrics or {}), horizon
         super().__init__(
             domain=OWN,
@@ -328,9 +311,6 @@ class InversionData(pl.LightningDataModule):
     ) -> None:
         super().__init__()
         self.save_hyperparameters()
-        if steps < 1 or demonstrations_per_concept < 1:
-            given = f"{steps} and {demonstrations_per_concept}"
-            raise UserError(f"data.steps, data.demonstrations_per_concept: expected 1 or more, found {given}")
         check_count("data.steps", steps, 1, LARGEST_STEP)
         check_count("data.demonstrations_per_concept", demonstrations_per_concept, 1, MOST_TOGETHER)
         check_range("data.seed", seed, 0)
@@ -341,19 +321,20 @@ class InversionData(pl.LightningDataModule):
         self.domain_name = domain if domain == OWN else recorded_name(domain)
         if demonstrations is None and domain == OWN:
             raise UserError("data.demonstrations: expected a file of the new concepts' demonstrations, found none")
-        if domain != OWN and suite not in (suites := load_domain(domain).concepts.suites):
-            raise UserError(f"data.suite: expected one of {', '.join(suites)}, found {suite!r}")
         if domain == OWN:
             self.demonstrations = read_own(str(demonstrations))
-        elif demonstrations is None:
-            self.demonstrations = self._drawn(load_domain(domain), suite, demonstrations_per_concept)
         else:
-            self.demonstrations = read_demonstrations(demonstrations, load_domain(domain))
+            known = load_domain(domain)
+            require(suite in known.concepts.suites, "data.suite", f"one of {', '.join(known.concepts.suites)}", repr(suite))
+            if demonstrations is None:
+                self.demonstrations = self._drawn(known, suite, demonstrations_per_concept)
+            else:
+                self.demonstrations = read_demonstrations(demonstrations, known)
         self.concepts = tuple(dict.fromkeys(self.demonstrations.concepts))
 
     def _drawn(self, domain: Domain, suite: str, count: int) -> Demonstrations:
-        if not (learned := domain.concepts.suites[suite].learned):
-            raise UserError(f"data.suite: expected a suite that learns concepts, found {suite!r}, which learns none")
+        learned = domain.concepts.suites[suite].learned
+        require(learned, "data.suite", "a suite that learns concepts", f"{suite!r}, which learns none")
         source = domain.source(self.root)
         return concatenate([source.draw(task, count, DEMONSTRATION_SEED + self.seed) for task in learned])
 

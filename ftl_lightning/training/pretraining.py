@@ -101,10 +101,7 @@ class Pretraining(pl.LightningModule, ABC, Generic[M]):
         told: float = 0.0,
     ) -> None:
         super().__init__()
-        # Configurations without privileged information keep their hash.
-        self.save_hyperparameters(
-            ignore=[*groups_of(self.flat), *([] if privileged else ["privileged"]), *([] if told else ["told"])]
-        )
+        self.save_hyperparameters(ignore=groups_of(self.flat))
         for name, value, most in (
             ("learning_rate", learning_rate, LARGEST_RATE),
             ("warmup_steps", warmup_steps, math.inf),

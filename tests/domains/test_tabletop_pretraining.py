@@ -73,8 +73,6 @@ def test_what_begins_elsewhere_and_corrections_join_the_training_set() -> None:
     assert len(data.training) == 9
     batch = data.batch(0)
     assert batch.observed[PLACES].shape == (8, 5, 4)
-    assert "recoveries" in data.hparams
-    assert not {"recoveries", "more"} & set(PretrainingData(domain=NAME, **SIZES).hparams)
     data.training.rows([0, 1]).save("more.safetensors")
     longer = PretrainingData(domain=NAME, more="more.safetensors", **SIZES)
     longer.setup("fit")

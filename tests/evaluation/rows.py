@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from ftl_lightning.evaluation.row import Row
+from ftl_lightning.evaluation.results import Row
 
 USUAL: dict[str, Any] = {"domain": "object_rearrangement", "setting": "new concept", "task": "t", "method": "FTL-IGM", "K": 2}
 USUAL |= {"variant": "free", "omega": "1.2", "demonstrations": 5, "seed": 0, "n": 50, "metric": "accuracy", "value": 0.5}

@@ -1,5 +1,6 @@
 import itertools
 import math
+import re
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
@@ -32,9 +33,7 @@ from ftl_lightning.evaluation.generation import (
     standard_error,
     tasks_of,
 )
-from ftl_lightning.evaluation.results import append_rows, read_rows
-from ftl_lightning.evaluation.row import Row
-from ftl_lightning.evaluation.rows import configuration
+from ftl_lightning.evaluation.results import Row, append_rows, config_hash, configuration, read_rows, reference_hash
 from ftl_lightning.evaluation.tensorboard import picture
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.point import Point
@@ -167,7 +166,7 @@ def test_the_keys_of_generation_stand_beside_those_of_the_callback() -> None:
     evaluator = Evaluator(suites=["paper"], figures=0, samples=3, sampler="ddim", steps=4, environments=["step veto"], seed=7)
     assert evaluator.generation == Generation(3, "ddim", 4, environments=["step veto"], seed=7)
     expected = {"suites": "paper", "samples": 3, "sampler": "ddim", "steps": 4, "environments": ["step veto"]}
-    assert evaluator.settings(LightningDataModule()) == expected | {"temperature": 0.1, "sample_seed": 7}
+    assert evaluator.settings(LightningDataModule()) == expected | {"temperature": 0.1, "sample_seed": 7, "replan": None}
     with pytest.raises(TypeError, match="sample"):
         Evaluator(sample=3)
 
@@ -213,7 +212,23 @@ def test_a_configuration_knows_demonstrations_by_their_content_or_as_a_data_set_
     data.hparams["demonstrations"] = "strokes/test-v0"
     assert configuration(module, data, {})["data/demonstrations"] == "strokes/test-v0"
     data.hparams.update({"demonstrations": None, "root": "/somewhere"})
-    assert not [key for key in configuration(module, data, {}) if key.startswith("data/")]  # where data are is no setting
+    described = configuration(module, data, {})
+    assert {key: value for key, value in described.items() if key.startswith("data/")} == {"data/demonstrations": None}
+
+
+def test_a_hash_has_a_version_and_changes_with_every_option_but_not_with_folders(tiny: Path) -> None:
+    module, data = Trained(read_model(GenerativeModel, tiny)), LightningDataModule()
+    module.hparams |= {"pretrained": "here", "output": "there", "knots": 1}
+    settings = {"samples": 3, "sample_seed": 0, "replan": None}
+    first = configuration(module, data, settings)
+    assert re.fullmatch("2:[0-9a-f]{16}", config_hash(first))
+    assert {first[key] for key in ("domain", "method", "model/knots")} == {"object_rearrangement", "trained", 1}
+    module.hparams |= {"pretrained": "elsewhere", "output": None, "_class_path": "package.Module"}
+    assert configuration(module, data, settings) == first
+    other = configuration(module, data, settings | {"temperature": 0.5})
+    assert config_hash(other) != config_hash(first)
+    assert reference_hash(other) == reference_hash(first)
+    assert reference_hash(configuration(module, data, settings | {"samples": 4})) != reference_hash(first)
 
 
 def test_tensorboard_gets_scalars_figures_hparams_and_projector(log: Path, tiny: Path) -> None:

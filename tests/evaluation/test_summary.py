@@ -4,7 +4,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from ftl_lightning.evaluation.row import Row
+from ftl_lightning.evaluation.results import Row
 from ftl_lightning.evaluation.summary import plain, show, summary_table
 from tests.evaluation.rows import REFERENCE
 from tests.evaluation.rows import row as usual_row

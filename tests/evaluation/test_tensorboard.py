@@ -12,7 +12,7 @@ from tensorboard.context import RequestContext
 from tensorboard.plugins.base_plugin import TBContext
 from tensorboard.plugins.hparams.backend_context import Context
 
-from ftl_lightning.evaluation.row import Row
+from ftl_lightning.evaluation.results import Row
 from ftl_lightning.evaluation.tensorboard import log_animation, log_projector, log_test, setting_means
 from ftl_lightning.igm.point import Part, Point
 from tests.evaluation.rows import REFERENCE

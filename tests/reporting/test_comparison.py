@@ -11,8 +11,7 @@ import torch
 from ftl_lightning.cli.main import main
 from ftl_lightning.domains.comparison import Compared
 from ftl_lightning.domains.registry import load_domain
-from ftl_lightning.evaluation.results import append_rows, read_rows, read_study
-from ftl_lightning.evaluation.row import Row
+from ftl_lightning.evaluation.results import Row, append_rows, read_rows, read_study
 from ftl_lightning.igm.concept import Concept, Origin
 from ftl_lightning.reporting.comparison import (
     all_methods,

@@ -6,8 +6,7 @@ import pytest
 
 from ftl_lightning.cli.main import main
 from ftl_lightning.domains.registry import load_domain
-from ftl_lightning.evaluation.results import append_rows, read_rows, read_study
-from ftl_lightning.evaluation.row import Row
+from ftl_lightning.evaluation.results import Row, append_rows, read_rows, read_study
 from ftl_lightning.reporting.comparison import all_methods, comparison_table, short_overview
 from ftl_lightning.reporting.figures import accuracy_bars
 from ftl_lightning.reporting.report import BEGIN, END, _splice

@@ -11,8 +11,7 @@ from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.domains.tasks import WITHOUT_WEIGHT, EvaluationTask
 from ftl_lightning.evaluation.references import FRESH, REPLAYED
-from ftl_lightning.evaluation.results import read_rows
-from ftl_lightning.evaluation.rows import configuration
+from ftl_lightning.evaluation.results import configuration, read_rows
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.igm.forms.leave_one_out import quickly
 from ftl_lightning.igm.inversion import Inversion, explained, invert

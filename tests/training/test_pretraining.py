@@ -18,8 +18,8 @@ from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.methods.ftl_igm.pretraining import LossOptions, PretrainingModule
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.training.checkpoint import WholeCheckpoints, read_checkpoint
+from ftl_lightning.training.data import PretrainingData
 from ftl_lightning.training.model_folder import read_model, save_model
-from ftl_lightning.training.rearrangement_datamodule import ObjectRearrangementData
 from ftl_lightning.training.trainer import Trainer
 from tests import tiny as sizes
 from tests.conftest import refused, succeed
@@ -39,7 +39,7 @@ def fit(
     quiet: dict[str, Any] = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False, "limit_val_batches": 0}
     keeps = any(isinstance(one, ModelCheckpoint) for one in callbacks)
     trainer = Trainer(max_steps=steps, accelerator="cpu", callbacks=[*callbacks], enable_checkpointing=keeps, **quiet)
-    trainer.fit(module, datamodule=ObjectRearrangementData(**few), ckpt_path=ckpt_path, weights_only=True)
+    trainer.fit(module, datamodule=PretrainingData("object_rearrangement", **few), ckpt_path=ckpt_path, weights_only=True)
     return module
 
 

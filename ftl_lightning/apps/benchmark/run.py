@@ -13,7 +13,7 @@ from ftl_lightning.apps.ablation.run import attempt
 from ftl_lightning.apps.benchmark.submission import GIVEN, PRETRAINED, Row, Run, Submission, scored
 from ftl_lightning.apps.benchmark.suite import REQUIRED, TRAINING, BenchmarkSuite, load_suite
 from ftl_lightning.domains.registry import load_domain
-from ftl_lightning.evaluation.row import METHOD, REFERENCE
+from ftl_lightning.evaluation.results import METHOD, REFERENCE
 from ftl_lightning.services.configuration import load
 from ftl_lightning.services.errors import UserError, about, require, short
 from ftl_lightning.services.progress import bar

@@ -102,8 +102,7 @@ class PretrainingModule(Pretraining[GenerativeModel]):
         **options: Any,
     ) -> None:
         super().__init__(learning_rate=learning_rate, guidance=guidance, **options)
-        # Omit the default of draws, which was added later, to keep hashes.
-        self.save_hyperparameters(ignore=[*groups_of(PRETRAINING), *(["draws"] if draws == 1 else [])])
+        self.save_hyperparameters(ignore=groups_of(PRETRAINING))
         self.save_hyperparameters(flat({"loss": loss, "codes": codes}, PRETRAINING))
         self.denoiser_args = dict(denoiser_args or {}) | (PAPER_SIZE.get(denoiser, {}) if paper_size else {})
         check_count("model.diffusion_steps", diffusion_steps, 1, MOST_STEPS)
