@@ -56,10 +56,7 @@ class Documented(NamedTuple):
     def refuses(self) -> bool:
         """Whether it raises a mistake of the user's itself."""
         raised = [node.exc for node in ast.walk(self.node) if isinstance(node, ast.Raise)]
-        called = [node for node in ast.walk(self.node) if isinstance(node, ast.Call)]
-        return any(isinstance(one, ast.Call) and ast.unparse(one.func) == "UserError" for one in raised) or any(
-            ast.unparse(one.func) == "require" for one in called
-        )
+        return any(isinstance(one, ast.Call) and ast.unparse(one.func) == "UserError" for one in raised)
 
 
 def documented(name: str) -> Iterator[Documented]:

@@ -229,7 +229,7 @@ def concept_files(names: Iterable[str], folder: Path, place: str) -> dict[str, P
 
 
 def write_concept(concept: Concept, path: Path, quality: object = None) -> None:
-    """Write a learned concept, and print its loss, weights, form and quality."""
+    """Write a learned concept to ``path``, and print its loss, weights, form and ``quality``."""
     concept.save(path)
     weights = ", ".join(f"{weight:.2f}" for weight in concept.weights.tolist())
     say(f"{path}: loss {concept.origin.loss:.3f}, weights {weights}")

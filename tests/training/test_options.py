@@ -103,9 +103,6 @@ def test_hyper_parameters_are_flat_under_the_names_that_results_know(tiny: Path)
     module = inversion_module(tiny, **options, components=3, seed=2)
     assert {name: module.hparams[name] for name in INVERSION} == options
     assert set(module.hparams) == {*INVERSION, "pretrained", "components", "omega", "output", "seed", "form"}
-    newer = {"start", "screening", "precision"}
-    older = inversion_module(tiny, **{name: value for name, value in options.items() if name not in newer})
-    assert INVERSION.keys() - set(older.hparams) == newer  # of which older rows know nothing
     fit = PretrainingModule(loss=pretraining.LossOptions(kind="v", discount=0.9), codes=Codes(share=0.5, knots=2))
     found = {"loss": "v", "timestep_power": 1.0, "loss_discount": 0.9, "condition_dropout": 0.1}
     found |= {"code_share": 0.5, "code_knots": 2, "code_size": 16, "code_noise": 0.3, "code_relative": True}

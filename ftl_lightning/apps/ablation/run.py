@@ -158,6 +158,9 @@ def planned(stages: Sequence[Stage], seeds: Sequence[int], root: str = "", only:
         seeds: each stage runs once per seed.
         root: ``data.root`` of every cell; empty for the value of the configurations.
         only: numbers of the stages; empty for all.
+
+    Raises:
+        UserError: without seeds, or for a number that is no stage.
     """
     require(seeds, "seeds", "one or more", "none")
     for number in only:
