@@ -23,15 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ftl_lightning.data.demonstrations import FORMATS, Contents, Demonstrations, Format
-from ftl_lightning.data.formats.episodes import (
-    Episode,
-    Metadata,
-    check_names,
-    from_episodes,
-    measured,
-    metadata,
-    to_episodes,
-)
+from ftl_lightning.data.formats.episodes import Episode, Metadata, check_names, from_episodes, measured, metadata, to_episodes
 from ftl_lightning.services.errors import UserError, about, require, short, shown
 from ftl_lightning.services.files import INFO, check_new_folder, read_text
 from ftl_lightning.services.shipped import check_extra
@@ -98,8 +90,7 @@ def read_contents(folder: str | Path, part: str = "", observed: Sequence[str] | 
     with about(root):
         part = _part(features, part)
         names = _observed(features, part, observed)
-    written = (root / METADATA).is_file()
-    given = Metadata()
+    given, written = Metadata(), (root / METADATA).is_file()
     if written:
         content = read_json(root / METADATA)
         with about(root / METADATA):
@@ -157,9 +148,8 @@ def _feature(key: str, fields: Mapping[str, Any]) -> _Feature:
     names = fields.get("names")
     if isinstance(names, dict) and len(names) == 1:  # {"motors": [...]}, as in older data sets
         (names,) = names.values()
-    if not isinstance(names, list) or len(names) != prod(shape) or not all(isinstance(name, str) for name in names):
-        names = None
-    return _Feature(feature.dtype, shape, None if names is None else tuple(names))
+    valid = isinstance(names, list) and len(names) == prod(shape) and all(isinstance(name, str) for name in names)
+    return _Feature(feature.dtype, shape, tuple(names) if valid else None)
 
 
 def _part(features: Mapping[str, _Feature], part: str) -> str:
