@@ -53,7 +53,7 @@ FORMATS: dict[str, Format] = {}
 
 
 def read_contents(path: str | Path) -> Contents:
-    """Read attributes of demonstrations in any format, see :meth:`Demonstrations.load`, without validating them."""
+    """Read attributes of demonstrations from a ``path`` as in :meth:`Demonstrations.load`, without validating them."""
     kind, name = read_from(str(path))
     return _format(kind, name).read(name)
 

@@ -77,11 +77,10 @@ def read_lerobot(folder: str | Path, part: str = "", observed: Sequence[str] | N
             is incomplete.
     """
     with about(folder):
-        return Demonstrations(**read_contents(folder, part, observed))
+        return Demonstrations(**_contents(folder, part, observed))
 
 
-def read_contents(folder: str | Path, part: str = "", observed: Sequence[str] | None = None) -> Contents:
-    """Read the attributes of demonstrations without validating them. Arguments and errors as in :func:`read_lerobot`."""
+def _contents(folder: str | Path, part: str = "", observed: Sequence[str] | None = None) -> Contents:
     check_extra("lerobot", f"{folder}: a LeRobot data set")
     from ftl_lightning.data.formats.parquet import read_columns
 
@@ -346,4 +345,4 @@ def _new_folder(folder: Path) -> Iterator[Path]:
         raise UserError(f"{folder}: cannot be written ({error.strerror or error}); choose a writable place with room") from error
 
 
-FORMATS["lerobot"] = Format(read_contents, write_lerobot)
+FORMATS["lerobot"] = Format(_contents, write_lerobot)

@@ -44,11 +44,10 @@ def read_minari(name: str, part: str = "", observed: Sequence[str] | None = None
         UserError: naming the data set, if it is not installed, damaged or empty, or its observations are no vectors.
     """
     with about(name):
-        return Demonstrations(**read_contents(name, part, observed))
+        return Demonstrations(**_contents(name, part, observed))
 
 
-def read_contents(name: str, part: str = "", observed: Sequence[str] | None = None) -> Contents:
-    """Read the attributes of demonstrations without validating them. Arguments and errors as in :func:`read_minari`."""
+def _contents(name: str, part: str = "", observed: Sequence[str] | None = None) -> Contents:
     check_extra("minari", f"{name}: expected a file, found none; a Minari data set of this name")
     import minari
 
@@ -149,4 +148,4 @@ def write_minari(demonstrations: Demonstrations, name: str) -> None:
         raise UserError(f"{name}: cannot be written as a Minari data set such as strokes/test-v0 ({error})") from error
 
 
-FORMATS["minari"] = Format(read_contents, write_minari)
+FORMATS["minari"] = Format(_contents, write_minari)
