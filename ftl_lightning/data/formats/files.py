@@ -37,6 +37,8 @@ _DAMAGED = (
 )
 """Exceptions of numpy and zipfile for damaged or foreign files."""
 
+Tell = Callable[[], None]
+
 
 def write_safetensors(demonstrations: Demonstrations, name: str) -> None:
     """Write a safetensors file, whole or not at all; the same demonstrations give the same bytes."""
@@ -190,7 +192,7 @@ def check_arrays(path: Path, size: int) -> None:
                     raise ValueError(f"{member.filename} is not of the size that its header states")
 
 
-def cached(settings: Mapping[str, Any], total: int, make: Callable[[Callable[[], None]], Demonstrations]) -> Demonstrations:
+def cached(settings: Mapping[str, Any], total: int, make: Callable[[Tell], Demonstrations]) -> Demonstrations:
     """Read demonstrations from the user's cache folder, or make and cache them, with a progress bar.
 
     Args:

@@ -147,8 +147,9 @@ def _feature(key: str, fields: Mapping[str, Any]) -> _Feature:
     names = fields.get("names")
     if isinstance(names, dict) and len(names) == 1:  # {"motors": [...]}, as in older data sets
         (names,) = names.values()
-    valid = isinstance(names, list) and len(names) == prod(shape) and all(isinstance(name, str) for name in names)
-    return _Feature(feature.dtype, shape, tuple(names) if valid else None)
+    if not isinstance(names, list) or len(names) != prod(shape) or not all(isinstance(name, str) for name in names):
+        return _Feature(feature.dtype, shape)
+    return _Feature(feature.dtype, shape, tuple(names))
 
 
 def _part(features: Mapping[str, _Feature], part: str) -> str:
