@@ -7,7 +7,7 @@ of 100 sets of three to ten good demonstrations pass (97 in driving).
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, Self
+from typing import Literal, Self, TypeVar
 
 import numpy as np
 import torch
@@ -16,39 +16,23 @@ from torch import Tensor
 from ftl_lightning.data.demonstrations import Demonstrations, read_contents
 from ftl_lightning.services.errors import about, short
 
-Severity = Literal["note", "warning", "error"]
-MOST_NAMED = 6
-"""Maximum number of demonstrations to list individually."""
-POINTS = 32
-"""Number of even times at which demonstrations are compared."""
-UNUSUAL = 3.0
-"""Ratio to all other lengths that makes a length unusual."""
-DISCRETE = 5
-"""Maximum number of distinct values of a discrete column, which may jump."""
-JUMP, JUMP_ALONE = 3.0, 10.0
-"""Ratio of a jump to the largest other step, in several columns and in a single column; fourfold for few steps."""
-WRAPPED = 0.8
-"""Share of a column's range that a step covers where an angle wraps."""
-STILL = 1e-3
-"""Maximum step that counts as standing still, as a share of the usual step."""
-FEW = 3
-"""Minimum steps of a still stretch, and of the longest demonstration, for a fault."""
-LONG = 0.4
-"""Minimum share of a demonstration in a still stretch."""
-SAME, ALIKE = 1e-6, 0.02
-"""Distances of equal and nearly equal demonstrations, as shares of the usual distance."""
-ENOUGH = 20
-"""Minimum numbers of a demonstration for a near-copy to be no coincidence; minimum steps to compare with."""
-UNITS = 10.0
-"""Ratio of values that suggests other units."""
-APART = {3: 25.0, 4: 12.0}
-"""Ratio to the usual distance that makes an outlier, by the number of demonstrations."""
-APART_PLACES, APART_SHAPES = 12.0, 4.0
-"""Ratios for five and more: of states, and of their shapes regardless of place and size."""
-CLOSEST = {3: 0.5}
-"""Minimum usual distance, as a share of the others' spread, by the number of demonstrations; otherwise 0.1."""
-BEYOND = 1.5
-"""Minimum ratio of an outlier's least distance to the others' largest, for five and more."""
+T = TypeVar("T")
+MOST_NAMED = 6  # demonstrations to list individually
+POINTS = 32  # number of even times at which demonstrations are compared
+UNUSUAL = 3.0  # ratio to all other lengths that makes a length unusual
+DISCRETE = 5  # maximum number of distinct values of a discrete column, which may jump
+JUMP, JUMP_ALONE = 3.0, 10.0  # ratio of a jump to the largest other step, in several columns and in one; fourfold for few steps
+WRAPPED = 0.8  # share of a column's range that a step covers where an angle wraps
+STILL = 1e-3  # maximum step that counts as standing still, as a share of the usual step
+FEW = 3  # minimum steps of a still stretch, and of the longest demonstration, for a fault
+LONG = 0.4  # minimum share of a demonstration in a still stretch
+SAME, ALIKE = 1e-6, 0.02  # distances of equal and nearly equal demonstrations, as shares of the usual distance
+ENOUGH = 20  # minimum numbers of a demonstration for a near-copy to be no coincidence; minimum steps to compare with
+UNITS = 10.0  # ratio of values that suggests other units
+APART = {3: 25.0, 4: 12.0}  # ratio to the usual distance that makes an outlier, by the number of demonstrations
+APART_PLACES, APART_SHAPES = 12.0, 4.0  # ratios for five and more: of states, and of their shapes regardless of place and size
+CLOSEST = {3: 0.5}  # minimum usual distance, as a share of the others' spread, by the number of demonstrations; otherwise 0.1
+BEYOND = 1.5  # minimum ratio of an outlier's least distance to the others' largest, for five and more
 
 
 @dataclass(frozen=True)
@@ -63,7 +47,7 @@ class Finding:
     """
 
     text: str
-    severity: Severity = "warning"
+    severity: Literal["note", "warning", "error"] = "warning"
     rows: tuple[int, ...] = ()
 
     def __str__(self) -> str:
@@ -88,11 +72,7 @@ def numbered(rows: Sequence[int]) -> str:
 
 
 def mended(states: Tensor, lengths: Tensor) -> tuple[Tensor, tuple[Finding, ...]]:
-    """Replace missing and non-finite numbers in states.
-
-    Args:
-        states: ``(demo, time, state)`` of any floating type.
-        lengths: ``(demo,)``, length of each demonstration.
+    """Replace missing and non-finite numbers in states ``(demo, time, state)`` of any floating type with lengths ``(demo,)``.
 
     Returns:
         States, linearly interpolated between finite values of a column (0 without any), and findings about them.
@@ -116,13 +96,7 @@ def mended(states: Tensor, lengths: Tensor) -> tuple[Tensor, tuple[Finding, ...]
 
 
 def read_mended(path: str) -> tuple[Demonstrations, tuple[Finding, ...]]:
-    """Read demonstrations with states that are not finite mended; those without a text are named after the file.
-
-    Args:
-        path: ``.npz``, safetensors, or a data set.
-
-    Returns:
-        Demonstrations, and findings for states that were not finite.
+    """Read a file or data set with non-finite states mended, and findings about them; missing texts become the file's name.
 
     Raises:
         UserError: naming the file, for every other mistake in it.
@@ -137,12 +111,9 @@ def read_mended(path: str) -> tuple[Demonstrations, tuple[Finding, ...]]:
 
 
 def check(demonstrations: Demonstrations) -> tuple[Finding, ...]:
-    """Check demonstrations of a single concept; errors and warnings come first.
+    """Check demonstrations as those of a single concept, whatever their texts; errors and warnings come first.
 
     Later comparisons exclude demonstrations with a fault.
-
-    Args:
-        demonstrations: treated as a single concept, whatever their texts.
     """
     few = Finding("three to five demonstrations are usual; fewer do not show which of them is odd", "note")
     findings = [*([few] if len(demonstrations) < 3 else []), *_constant(demonstrations)]
@@ -196,14 +167,14 @@ def _pairs(distances: Tensor) -> Tensor:
     return distances[row, column]
 
 
-def _others(count: int, row: int) -> list[int]:
-    return [index for index in range(count) if index != row]
+def _others(values: Sequence[T], row: int) -> list[T]:
+    return [*values[:row], *values[row + 1 :]]
 
 
 def _lengths(demonstrations: Demonstrations) -> Iterator[Finding]:
     lengths = demonstrations.lengths.tolist()
     for row, length in enumerate(lengths if len(lengths) > 2 else ()):
-        others = [lengths[index] for index in _others(len(lengths), row)]
+        others = _others(lengths, row)
         if UNUSUAL * length < min(others) or length > UNUSUAL * max(others):
             yield Finding(f"has {length} steps, the others {min(others)} to {max(others)}", rows=(row,))
 
@@ -252,7 +223,7 @@ def _stills(demonstrations: Demonstrations) -> Iterator[Finding]:
     runs = [_longest(sizes <= STILL * usual) for sizes in moved]
     shares = [run / max(len(sizes), 1) for sizes, (run, _) in zip(moved, runs, strict=True)]
     for row, (sizes, (run, start)) in enumerate(zip(moved, runs, strict=True)):
-        others = [shares[index] for index in _others(len(paths), row)]
+        others = _others(shares, row)
         if run < FEW or shares[row] < LONG:
             continue
         if run == len(sizes):
@@ -278,7 +249,7 @@ def _jumps(demonstrations: Demonstrations) -> Iterator[Finding]:
     states, steps = torch.cat(paths), [path.diff(dim=0).abs() for path in paths]
     continuous = [column for column in range(states.shape[1]) if len(states[:, column].unique()) > DISCRETE]
     for row, sizes in enumerate(steps if continuous else ()):
-        rest = torch.cat([steps[index] for index in _others(len(steps), row)] or [sizes[:0]])
+        rest = torch.cat(_others(steps, row) or [sizes[:0]])
         many = 1 if len(steps) > 1 and len(sizes) >= ENOUGH else 4  # among few steps a movement may stand out more
         worst = (0.0, 0, 0)
         for time in sizes[:, continuous].argmax(dim=0).unique().tolist() if len(sizes) else ():
@@ -317,7 +288,7 @@ def _units(demonstrations: Demonstrations) -> Iterator[Finding]:
     sizes = torch.stack([path.abs().amax(dim=0) for path in paths])
     varies = torch.cat(paths).std(dim=0, correction=0) > SAME * sizes.amax(dim=0)
     for row in range(len(paths) if len(paths) > 2 and varies.any() else 0):
-        others = sizes[_others(len(paths), row)][:, varies].clamp(min=1e-30)
+        others = sizes[_others(range(len(paths)), row)][:, varies].clamp(min=1e-30)
         ratios = (sizes[row, varies].clamp(min=1e-30) / others).median(dim=1).values
         if ratios.min() > UNITS or ratios.max() < 1 / UNITS:
             ratio = float(ratios.median())
@@ -329,8 +300,7 @@ def _shapes(points: Tensor) -> Tensor:
     """Points ``(demo, point, state)`` centred, with a root mean square of 1, in columns of spread 1."""
     centred = points / _spread(points)
     centred = centred - centred.mean(dim=1, keepdim=True)
-    size = centred.square().mean(dim=(1, 2), keepdim=True).sqrt()
-    return centred / size.clamp(min=SAME)
+    return centred / centred.square().mean(dim=(1, 2), keepdim=True).sqrt().clamp(min=SAME)
 
 
 def _outliers(demonstrations: Demonstrations) -> Iterator[Finding]:
@@ -355,10 +325,9 @@ def _far(points: Tensor, row: int) -> tuple[float, float]:
 
     Columns are scaled by the others' spread, lest an outlier hides itself.
     """
-    others = _others(len(points), row)
-    scale = torch.maximum(
-        points[others].flatten(0, 1).std(dim=0, correction=0), 0.1 * points.flatten(0, 1).std(dim=0, correction=0)
-    )
+    others = _others(range(len(points)), row)
+    all_spread, spread = (part.flatten(0, 1).std(dim=0, correction=0) for part in (points, points[others]))
+    scale = torch.maximum(spread, 0.1 * all_spread)
     apart = _apart(points / torch.where(scale > SAME, scale, 1))
     gaps, among = apart[row, others], _pairs(apart[others][:, others])
     closest = CLOSEST.get(len(points), 0.1)

@@ -53,7 +53,7 @@ FORMATS: dict[str, Format] = {}
 
 
 def read_contents(path: str | Path) -> Contents:
-    """Read attributes of demonstrations from ``path``, see :meth:`Demonstrations.load`, without validating them."""
+    """Read attributes of demonstrations from a ``path`` as in :meth:`Demonstrations.load`, without validating them."""
     kind, name = read_from(str(path))
     return _format(kind, name).read(name)
 
@@ -265,10 +265,7 @@ class Demonstrations(Shown):
             return cls(**contents)
 
     def fitted(self, features: Mapping[str, Feature]) -> Self:
-        """Return the demonstrations if their observed features are those of a domain.
-
-        Args:
-            features: features of the domain, by name.
+        """Return the demonstrations if their observed features are a domain's, ``features`` by name.
 
         Raises:
             UserError: for a feature that is missing or has another type or shape.
@@ -290,33 +287,26 @@ def concatenate(parts: Sequence[Demonstrations]) -> Demonstrations:
     first, longest = parts[0], max(part.states.shape[1] for part in parts)
     per_step = tuple(name for name in first.per_step if all(name in part.per_step for part in parts))
     scenes = [part.scenes for part in parts if part.scenes is not None]
+
+    def observed(part: Demonstrations, name: str) -> Tensor:
+        return _padded(part.observed[name], longest) if name in per_step else part.initial_states.observed[name]
+
     return replace(
         first,
         states=torch.cat([_padded(part.states, longest) for part in parts]),
         lengths=torch.cat([part.lengths for part in parts]),
         concepts=tuple(text for part in parts for text in part.concepts),
-        observed={
-            name: torch.cat(
-                [
-                    _padded(part.observed[name], longest) if name in per_step else part.initial_states.observed[name]
-                    for part in parts
-                ]
-            )
-            for name in first.observed
-        },
+        observed={name: torch.cat([observed(part, name) for part in parts]) for name in first.observed},
         per_step=per_step,
         scenes=torch.cat(scenes) if len(scenes) == len(parts) else None,
     )
 
 
 def padded(behaviours: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-    """Pad behaviours of different lengths to a single tensor.
-
-    Args:
-        behaviours: ``(time, ...)`` each, with at least one time.
+    """Pad ``behaviours`` ``(time, ...)`` of different lengths with their last time.
 
     Returns:
-        ``(demo, longest time, ...)``, each padded with its last time, and lengths ``(demo,)`` int64.
+        ``(demo, longest time, ...)``, and lengths ``(demo,)`` int64.
     """
     lengths = torch.tensor([len(behaviour) for behaviour in behaviours])
     longest = int(lengths.max())

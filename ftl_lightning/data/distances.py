@@ -13,12 +13,7 @@ Distance = Callable[[Tensor, Tensor], Tensor]
 def path_distance(paths: Tensor, others: Tensor) -> Tensor:
     """Root mean square over the horizon of the Euclidean distance, in the columns' unit.
 
-    Args:
-        paths: ``(a, horizon, column)``.
-        others: ``(b, horizon, column)``.
-
-    Returns:
-        ``(a, b)``.
+    ``(a, horizon, column)`` and ``(b, horizon, column)`` to ``(a, b)``.
     """
     # Differences, not products: the distance of a path to itself is exactly 0.
     between = torch.cdist(paths.flatten(1), others.flatten(1), compute_mode="donot_use_mm_for_euclid_dist")
@@ -42,14 +37,8 @@ def scaled_distance(real: Tensor, resolution: float = 0.0) -> Distance:
 def warped_distances(states: Tensor, lengths: Tensor, others: Tensor, other_lengths: Tensor) -> Tensor:
     """Mean distance per step after dynamic time warping (Sakoe & Chiba, 1978).
 
-    Args:
-        states: ``(n, time, state)``.
-        lengths: ``(n,)``.
-        others: ``(m, other time, state)``.
-        other_lengths: ``(m,)``.
-
-    Returns:
-        ``(n, m)``: the minimum sum of Euclidean distances along a warping path, divided by the longer length.
+    ``states (n, time, state)`` of ``lengths (n,)`` and ``others (m, other time, state)`` of ``other_lengths (m,)`` to ``(n, m)``:
+    the minimum sum of Euclidean distances along a warping path, divided by the longer length.
     """
     total = []
     for path, length in zip(states, lengths.tolist(), strict=True):

@@ -124,22 +124,14 @@ class InitialStates(Shown):
         return type(self)(take(self.observed, rows), None if self.scenes is None else self.scenes[rows])
 
     def require_scenes(self) -> Tensor:
-        """Return the scenes.
-
-        Raises:
-            UserError: if there are none.
-        """
+        """Return the scenes, or raise a :class:`UserError` if there are none."""
         if self.scenes is None:
             raise UserError("key 'scenes': expected (sample, scene), by which an environment is reset, found none")
         return self.scenes
 
 
 def check_starts(starts: InitialStates | None) -> InitialStates:
-    """Return initial states.
-
-    Raises:
-        UserError: if they are missing.
-    """
+    """Return initial states, or raise a :class:`UserError` if they are missing."""
     if starts is None:
         raise UserError("starts: expected initial states, found none; give the observed features where plans start")
     return starts

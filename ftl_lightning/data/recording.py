@@ -20,14 +20,11 @@ PART = "observation"
 
 
 def states_part(space: gymnasium.Space[Any], part: str = "") -> str:
-    """Key of the states in an observation.
+    """Key of the states in an observation; empty if the observation is itself a vector.
 
     Args:
         space: observation space.
         part: requested key; empty for :data:`PART` or the only vector.
-
-    Returns:
-        A key; empty if an observation is itself a vector.
 
     Raises:
         UserError: if the part is no vector or ambiguous.
@@ -116,9 +113,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any]):
         feature_parts(space, "", [part for part in self._observed.values() if isinstance(part, str)], images=True)
         names, units = (None if labels is None else tuple(labels) for labels in (state_names, state_units))
         self._extra = Metadata(domain, names, units, None, {"environment": str(env)})
-        self._keep_unfinished = keep_unfinished
-        self.concept = concept
-        self.dropped = 0
+        self._keep_unfinished, self.concept, self.dropped = keep_unfinished, concept, 0
         self._done: list[Episode] = []
         self._running: list[dict[str, NDArray[Any]]] = []
         self._shapes: dict[str, tuple[int, ...]] = {}

@@ -31,15 +31,10 @@ SIDE_BY_SIDE = 64
 
 
 def roll_out(loop: ClosedLoop, starts: InitialStates, policy: Policy) -> Rollout:
-    """Run an episode from each scene until its environment ends it, :data:`SIDE_BY_SIDE` at a time.
+    """Run an episode from each scene of ``starts`` until its environment ends it, :data:`SIDE_BY_SIDE` at a time.
 
     Gymnasium's ``SyncVectorEnv`` cannot do this: it resets all environments with the same options, an error of one environment ends
     all episodes, and without autoreset it fails at the first step after an episode has ended (version 1.4).
-
-    Args:
-        loop: the domain's environment.
-        starts: initial states with scenes.
-        policy: policy of the running episodes.
 
     Raises:
         UserError: naming the episode, for a scene that cannot be built.
@@ -138,12 +133,9 @@ def _lock_step(loop: ClosedLoop, rows: range, rollout: Rollout, policy: Policy, 
 
 
 class PlanFollower:
-    """Policy that follows plans. A plan with a non-finite value becomes NaN.
+    """Policy that makes plans, and replans after ``replan`` steps; 1 in the paper. A plan with a non-finite value becomes NaN.
 
-    Args:
-        make: function that makes plans.
-        act: the domain's planner, see :class:`~ftl_lightning.domains.domain.ClosedLoop`.
-        replan: number of steps before replanning; 1 in the paper.
+    ``act`` is the domain's planner, see :class:`~ftl_lightning.domains.domain.ClosedLoop`.
 
     Attributes:
         followed: plan ``(horizon, state)`` at each step, by episode.
@@ -169,13 +161,9 @@ class PlanFollower:
 def sampled_plans(
     model: ConceptModel, compositions: Sequence[Composition], sampling: Sampling, generators: Sequence[torch.Generator]
 ) -> MakePlans:
-    """Sample plans from a model, independently for each episode.
+    """Sample plans from a model, independently for each episode, with its composition ``(K, ...)`` and its generator.
 
-    Args:
-        model: generative model.
-        compositions: composition of each episode ``(K, ...)``.
-        sampling: sampler, steps and temperature.
-        generators: generator of each episode's noise and mode; the mode is kept for the whole episode.
+    A generator draws noise and the mode, which is kept for the whole episode.
     """
     compositions = [composition.drawn(draw) for composition, draw in zip(compositions, generators, strict=True)]
 

@@ -61,13 +61,8 @@ class Evaluator(pl.Callback):
         self.generation = Generation(**generation)
         check_count("evaluation.figures", figures, 0, 1000)
         self.suites = None if suites is None else tuple(suites)
-        self.closed_loop = closed_loop
-        self.figures = figures
-        self.results = results
-        self.references = references
-        self.diversity = diversity
-        self.films = films
-        self.variant = variant
+        self.closed_loop, self.figures, self.results, self.references = closed_loop, figures, results, references
+        self.diversity, self.films, self.variant = diversity, films, variant
         self.judged: list[TaskResult] = []
         self._projected = False
 
@@ -146,8 +141,7 @@ class Evaluator(pl.Callback):
         measured = rows(module, domain, self.judged, reference_lines, configured, self.variant)
         record(measured, self.results, trainer.log_dir or trainer.default_root_dir)  # before drawing, which may fail
         if self.films and trainer.is_global_zero:
-            count = write_films(self.films, domain, self.judged, reference_lines, measured)
-            say(f"{self.films}: {count} films")
+            say(f"{self.films}: {write_films(self.films, domain, self.judged, reference_lines, measured)} films")
         self._draw(trainer, module)
         if method_rows := own_rows(measured):
             hparams = hparams_of(module, data, settings, trainer, method_rows)
@@ -179,7 +173,6 @@ class Evaluator(pl.Callback):
 
 
 def _data(trainer: pl.Trainer) -> PretrainingData | InversionData:
-    """The trainer's data module."""
     data: PretrainingData | InversionData = trainer.datamodule  # type: ignore[attr-defined]
     return data
 

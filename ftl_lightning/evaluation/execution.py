@@ -32,16 +32,11 @@ def episodes(
     replan: int,
     seed: int,
 ) -> tuple[Rollout, Mapping[int, Sequence[Tensor]]]:
-    """Execute a concept from given scenes.
+    """Execute a ``concept`` ``(K, ...)`` by plans of ``model`` in ``loop``, an episode from each of ``starts``, which have scenes.
 
     Args:
-        model: model that makes the plans.
-        loop: environment.
-        concept: ``(K, ...)``.
-        starts: initial state and scene of each episode.
-        sampling: sampler, steps and temperature.
+        sampling, seed: sampler, steps and temperature; seed of the noise.
         replan: number of steps before replanning.
-        seed: seed of the noise.
 
     Returns:
         Rollout, and the plan ``(horizon, state)`` at each step, by episode.
@@ -85,10 +80,7 @@ class Execution(Shown):
         return {name: float(values.float().mean()) for name, values in self._judged().items()}
 
     def frames(self, episode: int = 0) -> list[NDArray[np.uint8]]:
-        """Render the frames ``(height, width, 3)`` of an episode.
-
-        Args:
-            episode: number of the episode, from 0.
+        """Render the frames ``(height, width, 3)`` of an ``episode``, a number from 0.
 
         Raises:
             UserError: for an episode that did not begin, or a domain without films of episodes.
@@ -100,11 +92,7 @@ class Execution(Shown):
         return film(self.rollout.take(episode, episode + 1), torch.stack(list(self.followed[episode])))
 
     def save(self, path: str | Path, episode: int = 0) -> None:
-        """Save an episode as an animated .gif.
-
-        Args:
-            path: output file.
-            episode: number of the episode, from 0.
+        """Save an ``episode``, a number from 0, to a ``path`` that ends in .gif.
 
         Raises:
             UserError: for another suffix, an episode that did not begin, or a domain without films of episodes.

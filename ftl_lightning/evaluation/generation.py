@@ -81,12 +81,7 @@ def evaluable(module: object) -> Evaluable:
 
 
 def demonstrations_of(task: EvaluationTask, demonstrated: Callable[[str], Demonstrations | None]) -> Demonstrations | None:
-    """Concatenate the demonstrations of a task's learned concepts; ``None`` without any.
-
-    Args:
-        task: evaluated task.
-        demonstrated: function from a concept's name to its demonstrations.
-    """
+    """Concatenate the demonstrations of a task's learned concepts, given by name; ``None`` without any."""
     learned = [demonstrations for name in task.learned if (demonstrations := demonstrated(name)) is not None]
     return concatenate(learned) if len(learned) > 1 else next(iter(learned), None)
 
@@ -133,8 +128,7 @@ class TaskResult:
         """Add a rollout, judged by the task's goal; failed episodes are no success.
 
         Args:
-            rollout: episodes.
-            domain: domain of the task.
+            rollout, domain: episodes, and domain of the task.
             environment: name of an alternative environment, whose outcomes are added to the existing outcomes; empty for the main.
             followed: plan ``(horizon, state)`` at each step of the first episode; ``None`` if it did not begin.
         """
@@ -177,11 +171,7 @@ def standard_error(values: Sequence[float]) -> float:
 def paired(generated: TaskResult, reference: TaskResult, policy: str, domain: Domain) -> dict[str, Tensor]:
     """Compare a method with a policy from the same initial states: episodes ``(sample,)`` in which only one of the two succeeds.
 
-    Args:
-        generated: behaviour of the method.
-        reference: behaviour of the policy.
-        policy: name of the policy.
-        domain: domain whose headline metric defines success, if it is an outcome.
+    The domain's headline metric defines success if it is an outcome.
 
     Returns:
         Episodes won and lost by metric name, in each environment in which both acted.
@@ -243,12 +233,9 @@ class Generation:
 
 
 def tasks_of(domain: Domain, suites: Sequence[str], learned: Sequence[str]) -> list[EvaluationTask]:
-    """List the evaluated tasks.
+    """List the evaluated tasks of suites, by name.
 
-    Args:
-        domain: domain of the tasks.
-        suites: names of suites of the domain.
-        learned: names of learned concepts. Concepts outside all suites become tasks if the domain can read them or has no metrics.
+    Learned concepts outside all suites become tasks if the domain can read their names or has no metrics.
 
     Raises:
         UserError: for an unknown suite.
@@ -274,9 +261,7 @@ def generate(
     """Generate and judge behaviour; tasks with equal numbers of samples share a batch.
 
     Args:
-        module: evaluated module.
-        tasks: evaluated tasks; tasks whose concepts were not learned are skipped.
-        generation: settings.
+        module, tasks, generation: evaluated module, tasks, and settings; tasks whose concepts were not learned are skipped.
         root: folder of the user's copy of the data.
 
     Returns:
@@ -319,12 +304,7 @@ def _starts(
 
 @torch.no_grad()
 def execute(module: Evaluable, judged: Sequence[TaskResult], generation: Generation) -> list[TaskResult]:
-    """Execute all tasks in parallel with replanning, in the domain's main and the alternative environments.
-
-    Args:
-        module: evaluated module.
-        judged: generated behaviour with the initial states of the episodes.
-        generation: settings.
+    """Execute all judged tasks in parallel with replanning, in the domain's main and the alternative environments.
 
     Raises:
         UserError: for a domain without an environment.

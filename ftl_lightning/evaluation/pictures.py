@@ -22,43 +22,32 @@ from ftl_lightning.evaluation.results import METHOD, Row
 from ftl_lightning.services.tensor_file import write_text
 from ftl_lightning.services.text import line
 
-SECONDS = 4.0
-"""Default duration of an animation."""
+SECONDS, END_SECONDS = 4.0, 1.5
+"""Default duration of an animation, and additional duration of its last frame."""
 FRAME_SECONDS = (0.05, 0.8)
 """Minimum and maximum duration of a frame; browsers slow down frames below 0.02 s."""
-END_SECONDS = 1.5
-"""Additional duration of the last frame."""
 COLOURS = 64
 """Default number of colours per picture: more colours preserve small objects but make larger files."""
-FONT_SIZE, MARGIN = 14, 6
-"""Font size and margin of captions in pixels."""
+FONT_SIZE, MARGIN = 14, 6  # of captions, in pixels
 INK, PAPER = (32, 32, 32), (255, 255, 255)
 FILMED = 4
 """Number of filmed samples or episodes per task."""
-FORMAT = 1
-"""Version of the format of film files."""
+FORMAT = 1  # of film files
 STEPS, ABSENT = 10_000, -32_768
 """Coordinate steps across the window's width, and the coordinate of an absent point."""
-MILLIMETRES = 1000
-"""Millimetres per metre; 3D coordinates are integers in millimetres."""
+MILLIMETRES = 1000  # per metre; 3D coordinates are integers in millimetres
 
 
 def frame_milliseconds(count: int, seconds: float | None = None) -> int:
-    """Duration of a frame, in the format's steps of 10 ms.
-
-    Args:
-        count: number of frames.
-        seconds: total duration; ``None`` for about :data:`SECONDS`, within the bounds of :data:`FRAME_SECONDS`.
-    """
+    """Duration of each of ``count`` frames, in the format's steps of 10 ms; without a total near :data:`SECONDS` in all."""
     each = float(np.clip(SECONDS / count, *FRAME_SECONDS)) if seconds is None else seconds / count
     return max(10 * round(100 * each), 20)
 
 
 def gif(pictures: Sequence[NDArray[np.uint8]], seconds: float | None = None, colours: int = COLOURS) -> bytes:
-    """Encode an endless animation.
+    """Encode an endless animation of pictures ``(height, width, 3)`` of equal size.
 
     Args:
-        pictures: ``(height, width, 3)`` each, of equal size.
         seconds: duration without the pause at the end; ``None`` for a readable speed.
         colours: number of colours per picture, up to 256.
     """
@@ -71,12 +60,9 @@ def gif(pictures: Sequence[NDArray[np.uint8]], seconds: float | None = None, col
 
 
 def captioned(pictures: Sequence[NDArray[np.uint8]], text: str, ending: str = "") -> list[NDArray[np.uint8]]:
-    """Add a caption below each picture ``(height, width, 3)``; long lines are wrapped.
+    """Add a caption below each picture ``(height, width, 3)``, all of equal size; long lines are wrapped.
 
-    Args:
-        pictures: pictures of equal size.
-        text: caption of every picture.
-        ending: additional caption of the last picture, such as the outcome; may be empty.
+    ``ending`` is added below the last picture, such as the outcome.
     """
     if not pictures or not (text or ending):
         return list(pictures)
@@ -100,14 +86,9 @@ def captioned(pictures: Sequence[NDArray[np.uint8]], text: str, ending: str = ""
 
 
 def side_by_side(films: Mapping[str, Sequence[NDArray[np.uint8]]]) -> list[NDArray[np.uint8]]:
-    """Combine films side by side, each above its name.
+    """Combine films, frames ``(height, width, 3)`` by name, side by side, each above its name.
 
-    Args:
-        films: frames ``(height, width, 3)`` by name, such as the demonstration, our method and the baselines. Shorter films repeat
-            the last frame; films of smaller height are aligned at the top.
-
-    Returns:
-        Frames ``(height, width, 3)`` for the length of the longest film.
+    Shorter films repeat the last frame; films of smaller height are aligned at the top.
     """
     rows = [captioned(film, name) for name, film in films.items() if len(film)]
     height = max((row[0].shape[0] for row in rows), default=0)
@@ -123,12 +104,7 @@ def side_by_side(films: Mapping[str, Sequence[NDArray[np.uint8]]]) -> list[NDArr
 
 
 def outcome_text(outcomes: Mapping[str, Tensor], episode: int = 0) -> str:
-    """Outcomes of an episode as text.
-
-    Args:
-        outcomes: outcomes by name ``(episode,)``, boolean or numeric.
-        episode: number of the episode.
-    """
+    """Outcomes ``(episode,)`` of an episode by name, boolean or numeric, as text."""
 
     def text(value: Tensor) -> str:
         return ("yes" if value else "no") if value.dtype == torch.bool else f"{value.item():.2f}"
@@ -182,17 +158,12 @@ def write_films(
     references: Mapping[str, Sequence[TaskResult]],
     rows: Sequence[Row],
 ) -> int:
-    """Write the vector films of an evaluation, for ``report --html``.
+    """Write the vector films of an evaluation to a JSON file, for ``report --html``, and return their number.
 
     Args:
-        path: JSON file.
-        domain: domain that draws.
-        judged: behaviour of the method.
+        path, domain, judged: file, domain that draws, and behaviour of the method.
         references: behaviour of the reference lines, by name.
         rows: rows of the evaluation, which describe the films.
-
-    Returns:
-        Number of films.
     """
     shapes: dict[str, int] = {}  # many films share roads and tables
     by_subject: dict[tuple[str, str, str], list[Row]] = {}

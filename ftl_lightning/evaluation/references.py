@@ -42,8 +42,7 @@ _LOG = logging.getLogger(__name__)
 T = TypeVar("T")
 REPLAYED, FRESH = "demonstrations replayed", "fresh samples"
 """Names of the reference lines of novelty and coverage."""
-KEPT = 500
-"""Maximum number of plans, rollouts and fresh samples in the cache: several times those of an evaluation."""
+KEPT = 500  # plans, rollouts and fresh samples in the cache: several times those of an evaluation
 _CACHE: dict[Hashable, Any] = {}
 """Reference behaviour by name and all arguments, shared by the cells of an ablation."""
 
@@ -61,13 +60,9 @@ def _cached(key: Hashable, compute: Callable[[], T]) -> T:
 def references(
     judged: Sequence[TaskResult], domain: Domain, seed: int, environments: Sequence[str] = ()
 ) -> dict[str, list[TaskResult]]:
-    """Behaviour of each reference policy by name, executed if the method's behaviour was executed.
+    """Behaviour of each reference policy by name, executed if the method's behaviour (``judged``) was executed.
 
-    Args:
-        judged: behaviour of the method.
-        domain: domain of the policies.
-        seed: seed of the policies.
-        environments: alternative environments in which the method's behaviour was executed.
+    ``environments`` are the alternative environments of that execution.
     """
     loop = None if all(behaviour.rollout is None for behaviour in judged) else domain.closed_loop
     by_policy = {
@@ -221,11 +216,10 @@ def coverage(distances: Tensor) -> float:
 
 
 def real_behaviour(judged: Sequence[TaskResult], domain: Domain, root: Path | None = None, seed: int = 0) -> list[Real]:
-    """Collect the real behaviour of each task.
+    """Collect the real behaviour of each task of generated behaviour.
 
     Args:
-        judged: generated behaviour.
-        domain: domain of the tasks.
+        judged, domain: generated behaviour, and its domain.
         root: folder of the user's copy of the data.
         seed: seed of the fresh samples.
     """

@@ -36,20 +36,13 @@ HPARAMS = ".hparams"
 """Suffix of the event file for the HPARAMS tab. The file is separate so that a later test can replace it: TensorBoard shows only
 the first settings of a run."""
 COLUMNS = ("text", "set", "component", "part")
-"""Metadata columns of the projector."""
-WITHOUT = "-"
-"""Placeholder for a point without a component."""
+"""Metadata columns of the projector; '-' for a point without a component."""
 
 
 def draw(logger: TensorBoardLogger, judged: Sequence[TaskResult], domain: Domain, figures: int, step: int) -> None:
     """Log a figure of each task's plans and films of the first plan and the first episode.
 
-    Args:
-        logger: output.
-        judged: generated behaviour.
-        domain: domain that draws.
-        figures: number of samples in a figure, 1 or more, and maximum number of demonstrations.
-        step: global step.
+    A figure has as many samples, and at most as many demonstrations, as ``figures``, 1 or more.
     """
     for behaviour in judged:
         name = f"{behaviour.task.setting}/{behaviour.task.name}"
@@ -68,13 +61,7 @@ def title(behaviour: TaskResult) -> str:
 
 
 def picture(behaviour: TaskResult, domain: Domain, figures: int) -> "Figure":
-    """Draw plans, framed green if right and red if wrong, below the demonstrations.
-
-    Args:
-        behaviour: behaviour of a task.
-        domain: domain that draws.
-        figures: number of plans, and maximum number of demonstrations.
-    """
+    """Draw plans, framed green if right and red if wrong, below the demonstrations; at most ``figures`` of each."""
     shown = slice(0, figures)
     starts = None if behaviour.starts is None else behaviour.starts.take(shown)
     right = None if behaviour.right is None else behaviour.right[shown].tolist()
@@ -100,11 +87,7 @@ def log_animation(logger: TensorBoardLogger, tag: str, frames: Sequence[NDArray[
 
 
 def setting_means(values: Iterable[tuple[str, str, float]]) -> dict[str, float]:
-    """Mean over tasks of every metric and setting, such as ``'accuracy/new concept'``; names are the same in every domain.
-
-    Args:
-        values: setting, metric and value of each task.
-    """
+    """Mean of ``(setting, metric, value)`` over tasks, such as ``'accuracy/new concept'``; names are the same in every domain."""
     by_name: dict[str, list[float]] = {}
     for setting, metric, value in values:
         by_name.setdefault(f"{metric}/{setting}", []).append(value)
@@ -112,11 +95,7 @@ def setting_means(values: Iterable[tuple[str, str, float]]) -> dict[str, float]:
 
 
 def own_rows(rows: Sequence[Row]) -> list[Row]:
-    """Rows of the method without reference lines and paired comparisons.
-
-    Args:
-        rows: see :func:`ftl_lightning.evaluation.results.rows`.
-    """
+    """Rows of the method without reference lines and paired comparisons."""
     return [row for row in rows if row.role == METHOD and not row.metric.startswith((WON, LOST))]
 
 
@@ -124,32 +103,21 @@ def own_rows(rows: Sequence[Row]) -> list[Row]:
 def log_test(logger: TensorBoardLogger, settings: Mapping[str, Any], rows: Sequence[Row], step: int) -> None:
     """Log the results of a test to the HPARAMS tab and, as tables of settings and tasks, to the TEXT tab.
 
-    Args:
-        logger: output.
-        settings: see :func:`ftl_lightning.evaluation.summary.hparams_of`.
-        rows: rows of the method and of reference lines.
-        step: global step.
+    ``settings`` are those of :func:`ftl_lightning.evaluation.summary.hparams_of`; ``rows`` include reference lines.
     """
     measured = own_rows(rows)
     means = setting_means((row.setting, row.metric, row.value) for row in measured)
-    log_hparams(logger, settings, {f"{RESULTS}/{name}": value for name, value in means.items()}, step)
+    _log_hparams(logger, settings, {f"{RESULTS}/{name}": value for name, value in means.items()}, step)
     tasks = list(dict.fromkeys(row.task for row in measured))
     logger.experiment.add_text(f"{RESULTS}/settings", plain(summary_table(rows)), step)
     logger.experiment.add_text(f"{RESULTS}/tasks", plain(summary_table(rows, tasks)), step)
 
 
-@rank_zero_only
-def log_hparams(logger: TensorBoardLogger, settings: Mapping[str, Any], metrics: Mapping[str, float], step: int = 0) -> None:
+def _log_hparams(logger: TensorBoardLogger, settings: Mapping[str, Any], metrics: Mapping[str, float], step: int) -> None:
     """Log a run with its results to the HPARAMS tab, replacing an earlier entry of the run.
 
     No list of hyper-parameters and metrics is written: TensorBoard would apply an arbitrary run's list to all runs and hide the
     metrics of other domains. Without a list it collects all names.
-
-    Args:
-        logger: logger of the run.
-        settings: values by name; anything but numbers and booleans becomes text.
-        metrics: values by name.
-        step: global step.
     """
     plain_values = {key: value if isinstance(value, bool | int | float) else str(value) for key, value in settings.items()}
     folder = Path(logger.log_dir)
@@ -164,16 +132,10 @@ def log_hparams(logger: TensorBoardLogger, settings: Mapping[str, Any], metrics:
 
 
 def log_projector(logger: TensorBoardLogger, points: Sequence[Point], step: int) -> None:
-    """Log concept embeddings to the projector, with :data:`COLUMNS` for labels and colours.
-
-    Args:
-        logger: output.
-        points: points of the same concept space.
-        step: global step.
-    """
+    """Log points of a concept space to the projector, with :data:`COLUMNS` for labels and colours."""
 
     def labels(part: Part | None) -> tuple[str, str]:
-        return (WITHOUT, WITHOUT) if part is None else (str(part.component), part.name)
+        return ("-", "-") if part is None else (str(part.component), part.name)
 
     if points:
         embeddings = torch.stack([point.embedding.cpu() for point in points])

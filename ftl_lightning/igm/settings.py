@@ -7,8 +7,7 @@ from typing import Any, Literal, Self
 
 from ftl_lightning.igm.diffusion import LARGEST_POWER, LOSSES
 from ftl_lightning.services.errors import require
-from ftl_lightning.services.option_groups import replaced
-from ftl_lightning.services.validation import LARGEST, LARGEST_RATE, MOST_TOGETHER, check_count, check_factor, check_range
+from ftl_lightning.services.validation import LARGEST, LARGEST_RATE, MOST_TOGETHER, check_count, check_factor, check_range, replaced
 
 EXPLAINED = 0.4
 """Minimum gain of one set of embeddings, as a share of the modes' gain, to use mixtures; chosen on validation suites."""

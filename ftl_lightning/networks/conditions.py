@@ -91,7 +91,7 @@ def sinusoidal_embedding(t: Tensor, dimension: int, period: float = 10_000.0) ->
 
 
 class ConditionEncoder(nn.Module, ABC):
-    """Base class of condition encoders."""
+    """Base class of condition encoders, which are constructed with the domain's :class:`Sizes` and their number of features."""
 
     @abstractmethod
     def observe(self, vector: Tensor) -> Context:
@@ -111,12 +111,7 @@ def _mlp(inputs: int, width: int) -> nn.Sequential:
 
 
 class FlatEncoder(ConditionEncoder):
-    """MLP of all vectors, as in the paper, independent of the concept.
-
-    Args:
-        sizes: size of the observed vectors.
-        width: number of features.
-    """
+    """MLP of all vectors, as in the paper, independent of the concept."""
 
     def __init__(self, sizes: Sizes, width: int) -> None:
         super().__init__()
@@ -127,12 +122,7 @@ class FlatEncoder(ConditionEncoder):
 
 
 class JointEncoder(ConditionEncoder):
-    """MLP of all vectors and the concept. The paper does not specify where they are combined.
-
-    Args:
-        sizes: sizes of the observed vectors and the concept.
-        width: number of features.
-    """
+    """MLP of all vectors and the concept. The paper does not specify where they are combined."""
 
     def __init__(self, sizes: Sizes, width: int) -> None:
         super().__init__()
@@ -147,15 +137,10 @@ class JointEncoder(ConditionEncoder):
 
 
 class _Entities(ConditionEncoder):
-    """Base class of encoders of exchangeable entities.
+    """Base class of encoders of exchangeable entities. Columns of no entity are appended to every entity and to the features."""
 
-    Columns that belong to no entity are appended to every entity and to the features.
-    """
-
-    columns: Tensor
-    """Columns of each entity ``(entity, column)``."""
-    shared: Tensor
-    """Columns that belong to no entity."""
+    columns: Tensor  # of each entity (entity, column)
+    shared: Tensor  # columns that belong to no entity
     entity: nn.Sequential
 
     def __init__(self, name: str, sizes: Sizes) -> None:
@@ -183,13 +168,9 @@ class EntityEncoder(_Entities):
 
     The concept determines a weight for each attribute column. The attention logit of an entity is the weighted sum of its
     attributes, so the weights for *red* and for *bowl* add up to those of an unseen red bowl. The values exclude the attributes, so
-    a red bowl is approached like any other object. There is a single head: several heads can disagree about the target,
-    which traps concepts learned through them. The encoder is invariant to exchanging entities.
-
-    Args:
-        sizes: sizes of the observed vectors and their entities. Attribute columns are keys only; without named attributes all
-            columns are keys and values.
-        width: number of features.
+    a red bowl is approached like any other object; without named attributes all columns are keys and values. There is a single
+    head: several heads can disagree about the target, which traps concepts learned through them. The encoder is invariant to
+    exchanging entities.
     """
 
     def __init__(self, sizes: Sizes, width: int) -> None:
@@ -224,12 +205,7 @@ class EntityEncoder(_Entities):
 
 
 class SetEncoder(_Entities):
-    """Max and mean pooling over the features of entities (deep sets, Zaheer et al., 2017), independent of the concept.
-
-    Args:
-        sizes: sizes of the observed vectors and their entities.
-        width: number of features.
-    """
+    """Max and mean pooling over the features of entities (deep sets, Zaheer et al., 2017), independent of the concept."""
 
     def __init__(self, sizes: Sizes, width: int) -> None:
         super().__init__("set", sizes)
@@ -251,10 +227,6 @@ class PointEncoder(ConditionEncoder):
     every difference between two, are the vector, its direction and the logarithm of its length, which resolves near and far. The
     coordinates of all points are additional features. If plans have a plane, all vectors and the plan are rotated into the
     direction from the first chosen point to the second, so the encoder is equivariant to rotation.
-
-    Args:
-        sizes: sizes with the number of image features, which must be points.
-        width: number of features.
 
     Raises:
         UserError: for an image encoder without points.
@@ -311,18 +283,13 @@ class PointEncoder(ConditionEncoder):
 
 
 def turned(values: Tensor, direction: Tensor, plane: Sequence[int], back: bool) -> Tensor:
-    """Rotate vectors into the frame whose x axis is a direction, or back.
+    """Rotate vectors ``(batch, ..., column)`` into the frame whose x axis is ``direction (batch, 2)``, of unit length, or back.
 
-    Args:
-        values: ``(batch, ..., column)``.
-        direction: unit vectors ``(batch, 2)``.
-        plane: columns of x and y.
-        back: apply the inverse rotation.
+    The columns of x and y are ``plane``.
     """
     x, y = (values[..., column] for column in plane)
     cos, sin = (part.reshape(-1, *(1,) * (x.dim() - 1)) for part in direction.unbind(dim=1))
-    if back:
-        sin = -sin
+    sin = -sin if back else sin
     columns = list(values.unbind(dim=-1))
     columns[plane[0]], columns[plane[1]] = cos * x + sin * y, cos * y - sin * x
     return torch.stack(columns, dim=-1)

@@ -30,12 +30,7 @@ POINT = 4
 
 
 class ResidualBlock(nn.Module):
-    """Two 3 x 3 convolutions with group normalisation (He et al., 2016).
-
-    Args:
-        inputs, outputs: channels.
-        stride: stride of the first convolution.
-    """
+    """Two 3 x 3 convolutions with group normalisation (He et al., 2016), the first with a stride."""
 
     def __init__(self, inputs: int, outputs: int, stride: int) -> None:
         super().__init__()
@@ -52,12 +47,7 @@ class ResidualBlock(nn.Module):
 
 
 class SpatialSoftmax(nn.Module):
-    """Spatial softmax: position and value of the maximum of each channel (Levine et al., 2016).
-
-    Args:
-        channels: channels of the feature map.
-        keypoints: number of keypoints.
-    """
+    """Spatial softmax: position and value of the maximum of each channel (Levine et al., 2016)."""
 
     def __init__(self, channels: int, keypoints: int) -> None:
         super().__init__()
@@ -164,8 +154,7 @@ class ImageEncoder(nn.Module):
             require(min(height, width) >= 2 * stride, f"{key}.crop", least, f"{height} x {width}")
             self.network, maps = _small(channels, widths, stride, height, width)
         self.head: nn.Module
-        self.values = POINT if head == POINTS else 3
-        """Values per keypoint or point."""
+        self.values = POINT if head == POINTS else 3  # per keypoint or point
         if head == GRID:
             self.head, self.size = nn.Sequential(nn.Conv2d(maps[0], keypoints, 1), nn.Flatten()), keypoints * maps[1] * maps[2]
         elif head == POINTS:
@@ -174,7 +163,6 @@ class ImageEncoder(nn.Module):
             self.head = nn.Sequential(parts)
         else:
             self.head, self.size = SpatialSoftmax(maps[0], keypoints), 3 * keypoints
-        """Number of features."""
 
     def forward(self, images: Tensor) -> Tensor:
         """``(batch, channels, height, width)`` uint8 to ``(batch, size)``, keypoints relative to the image centre."""
@@ -193,11 +181,7 @@ class ImageEncoder(nn.Module):
 
 
 class ImageEncoders(nn.Module):
-    """An :class:`ImageEncoder` for each observed image, with concatenated features.
-
-    Args:
-        observed: features by name, including the images.
-        arguments: arguments of every encoder.
+    """An :class:`ImageEncoder` with the same arguments for each observed image, with concatenated features.
 
     Raises:
         UserError: for invalid arguments.
@@ -215,19 +199,13 @@ class ImageEncoders(nn.Module):
         self.encoders = nn.ModuleList(encoders)
         self.sizes = [encoder.size for encoder in encoders]
         self.size = sum(self.sizes)
-        """Number of features of all images."""
 
     def forward(self, observed: Observed) -> Tensor:
         """Images by name ``(batch, *shape)`` to ``(batch, size)``."""
         return torch.cat([encoder(observed[name]) for name, encoder in zip(self.names, self.encoders, strict=True)], dim=-1)
 
     def from_origins(self, read: Tensor, observed: Observed) -> Tensor:
-        """Shift keypoints to be relative to their origins.
-
-        Args:
-            read: features ``(batch, size)``, possibly of earlier images.
-            observed: vectors by name, including the current origins.
-        """
+        """Shift keypoints in features ``(batch, size)``, possibly of earlier images, to be relative to the current origins."""
         parts = []
         for part, origin, values in zip(read.split(self.sizes, dim=1), self.origins, self.values, strict=True):
             if origin:

@@ -106,11 +106,6 @@ class MLPDenoiser(nn.Module):
         The function returns a new ``(batch, hidden_dim)`` in single precision. Sampling and evaluating losses have few timesteps:
         parameters are computed once per pair of timestep and concept. Learning several concepts shares timesteps: the timestep's
         part is computed once per timestep. All variants are bitwise equal.
-
-        Args:
-            t: ``(batch,)`` int64.
-            concepts: ``(concept, n)``.
-            index: row of ``concepts`` for each sample ``(batch,)``.
         """
         # Single precision regardless of autocast: these products are few, and their gradients are summed over many plans.
         with torch.autocast(t.device.type, enabled=False):

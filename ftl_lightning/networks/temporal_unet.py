@@ -22,11 +22,7 @@ def _convolution(inputs: int, outputs: int) -> nn.Sequential:
 
 
 def over_time(knots: Tensor, times: int) -> Tensor:
-    """Interpolate linearly between knots that are evenly spaced from the first time to the last.
-
-    Args:
-        knots: ``(batch, knot, columns)``.
-        times: number of times.
+    """Interpolate linearly between knots ``(batch, knot, columns)``, evenly spaced from the first time to the last.
 
     Returns:
         ``(batch, columns, times)``, or ``(batch, columns, 1)`` for a single knot.
@@ -127,8 +123,7 @@ class TemporalUNet(nn.Module):
         require(is_clock, "denoiser_args.clock", f"an even number up to {MOST_CLOCK}", clock)
         expected = "points without a plane for TemporalUNet, which turns no plans"
         require(initial_encoder != "points" or not sizes.plane, "denoiser_args.initial_encoder", expected, "points with a plane")
-        self.smooth = smooth
-        self.width, self.broadcast = width, broadcast and sizes.vector_dim > 0
+        self.smooth, self.width, self.broadcast = smooth, width, broadcast and sizes.vector_dim > 0
         # Explicit CPU: arithmetic on the meta device makes torch import its compiler.
         rates = 2.0 ** torch.arange(-1, clock // 2 - 1, device="cpu")[:, None]
         angle = torch.linspace(0, math.pi, sizes.horizon, device="cpu") * rates
@@ -150,9 +145,8 @@ class TemporalUNet(nn.Module):
         self.grow = nn.ModuleList(nn.ConvTranspose1d(width, width, 4, stride=2, padding=1) for width in channels[-2::-1])
         self.out = nn.Sequential(_convolution(width, width), nn.Conv1d(width, sizes.state_dim, 1))
         self.skip = nn.Conv1d(width, width, 1) if skip else None
-        if self.skip is not None:
-            for parameter in self.skip.parameters():
-                nn.init.zeros_(parameter)
+        for parameter in self.skip.parameters() if self.skip is not None else ():
+            nn.init.zeros_(parameter)
 
     def observe(self, vector: Tensor | None) -> Context:
         """Encode the normalised observed vectors ``(batch, m)`` once per plan; empty without vectors."""

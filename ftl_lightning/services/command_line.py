@@ -23,8 +23,6 @@ from ftl_lightning.services.files import (
 )
 from ftl_lightning.services.shipped import check_extra, missing_model, pretrained_folder, shipped
 
-FLAGS = ("help", "print_config", "version")
-"""Options without a value."""
 _LONG = {"-c": "--config", "-h": "--help"}
 
 
@@ -51,7 +49,7 @@ class Arguments:
             name = _LONG.get(name, name)
             if name.startswith("--"):
                 options.append((name[2:], value if equals else None))
-                waiting = not equals and name[2:] not in FLAGS
+                waiting = not equals and name[2:] not in ("help", "print_config", "version")
             elif waiting:
                 options[-1] = (options[-1][0], argument)
                 waiting = False
@@ -76,11 +74,7 @@ class Arguments:
         return [value for value in self.values("config") if _is_path(value)]
 
     def expanded(self, verb: str = "") -> list[str]:
-        """:meth:`words` with the content of configuration files.
-
-        Raises:
-            UserError: as :func:`~ftl_lightning.services.configuration.load`.
-        """
+        """:meth:`words` with the content of configuration files, see :func:`~ftl_lightning.services.configuration.load`."""
         options = (
             (name, OmegaConf.to_yaml(OmegaConf.create(load(value, verb))) if name == "config" and _is_path(value) else value)
             for name, value in self.options
@@ -131,7 +125,6 @@ def _written_demonstrations(path: str, option: str) -> None:
     check_extra(kind, f"{option}: {short(path)}: this data set")
     if kind == "lerobot":
         check_new_folder(name, option)
-        check_writable_folder(name, option)
 
 
 def _table(path: str, option: str) -> None:
@@ -155,21 +148,18 @@ TRAINER: Mapping[str, Check] = {
     "evaluation.films": check_writable_file,
 }
 """Checks of verbs with a trainer, by option without ``init_args``, as on the command line."""
-_COMMANDS: Mapping[str, Check] = {"pretrained": _model, "concept": _concept, "initial": _demonstrations}
-_OUT: Mapping[str, Check] = {"out": _written_demonstrations}
 _FOLDER: Mapping[str, Check] = {"out": check_writable_folder}
 _WRITTEN: Mapping[str, Mapping[str, Check]] = {
-    "generate": _OUT,
+    "generate": {"out": _written_demonstrations},
     "check": {"figure": check_writable_file},
     "encode": {"out": _table},
     "invert": _FOLDER,
-    "sample": {**_OUT, **dict.fromkeys(("figure", "animation", "export"), check_writable_file)},
+    "sample": {"out": _written_demonstrations, **dict.fromkeys(("figure", "animation", "export"), check_writable_file)},
     "ablate": {"results": _results, "slurm": check_writable_file},
     "benchmark": {
-        "out": check_writable_file,
         "check": _text("submission"),
-        "leaderboard": check_writable_file,
         "data": check_writable_folder,
+        **dict.fromkeys(("out", "leaderboard"), check_writable_file),
     },
     "report": {**_FOLDER, "readme": _text("Markdown"), "html": check_writable_file},
     "play": {"demonstrations": lambda path, option: check_readable(path, "demonstrations"), "static": check_writable_folder},
@@ -180,16 +170,11 @@ _WRITTEN: Mapping[str, Mapping[str, Check]] = {
 
 def command_checks(verb: str) -> Mapping[str, Check]:
     """Checks of a verb without a trainer."""
-    return {**_COMMANDS, **_WRITTEN.get(verb, {})}
+    return {"pretrained": _model, "concept": _concept, "initial": _demonstrations, **_WRITTEN.get(verb, {})}
 
 
 def check_inputs(verb: str, arguments: Arguments, checks: Mapping[str, Check]) -> None:
-    """Refuse arguments, configuration files included, with missing input files or invalid outputs.
-
-    Args:
-        verb: verb whose sections of configuration files apply.
-        arguments: arguments after the verb.
-        checks: checks by option.
+    """Refuse arguments after a verb, configuration files included, with missing input files or invalid outputs.
 
     Raises:
         UserError: for the first such file, or an unreadable configuration file.
@@ -241,15 +226,9 @@ _KEY = re.compile(r"""(?:[Kk]ey|[Oo]ption) ['"]([\w.]+)['"]""")
 
 
 def one_line(message: str, verb: str, arguments: Arguments) -> str:
-    """Shorten a message of jsonargparse to one line.
+    """Shorten a message of jsonargparse to one line: file and line, if a configuration file has the key; then the mistake.
 
-    Args:
-        message: message of the parser.
-        verb: verb whose sections of configuration files apply.
-        arguments: arguments after the verb; their configuration files are searched for the key unless an option names it.
-
-    Returns:
-        File and line, if a file has the key; then the mistake.
+    The configuration files of ``arguments`` are searched for the key unless an option names it.
     """
     lines = [line.strip(" -") for line in message.splitlines()]
     relevant = " ".join(line for line in lines if line and not line.startswith(_NOISE))

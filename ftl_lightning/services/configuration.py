@@ -66,26 +66,20 @@ def load(path: str | Path, verb: str = "") -> dict[str, Any]:
 
     Args:
         path: path of the file.
-        verb: verb whose sections apply; ``validate`` and ``test`` use those of ``fit``. For another verb, or none, ``fit`` and
-            ``invert`` are ordinary keys.
+        verb: verb whose sections apply; ``validate`` and ``test`` use those of ``fit``. For any other, sections are ordinary keys.
 
     Raises:
         UserError: with the file, if it or a default is missing, damaged or no mapping, or defaults are circular.
     """
     try:
         merged = OmegaConf.merge(OmegaConf.create(), *(OmegaConf.create(keys) for _, keys in parts(path, verb)))
-        keys = OmegaConf.to_container(merged, resolve=False)
+        return _plain(OmegaConf.to_container(merged, resolve=False))
     except (OmegaConfBaseException, RecursionError, TypeError, ValueError) as error:  # not only OmegaConf's errors
         raise UserError(f"{path}: expected keys that go together, found others ({short(str(error), 150)})") from error
-    return _plain(keys)
 
 
 def parts(path: str | Path, verb: str = "") -> list[tuple[Path, dict[str, Any]]]:
-    """Parts merged by :func:`load`, in order: files with their raw keys; the last is the file itself.
-
-    Raises:
-        UserError: as :func:`load`.
-    """
+    """Parts merged by :func:`load`, in order: files with their raw keys; the last is the file itself. Errors as :func:`load`."""
     return list(_merged(find(path), section_of(verb), ()))
 
 
@@ -118,8 +112,9 @@ def _beside(path: Path, name: str) -> Path:
     try:
         for folder in path.absolute().parents:
             if (folder / name).is_file():
-                # Relative if the user's path is.
-                return folder / name if path.is_absolute() else _relative(folder / name)
+                found = folder / name
+                relative = not path.is_absolute() and found.is_relative_to(Path.cwd())  # as the user's path is
+                return found.relative_to(Path.cwd()) if relative else found
         if (ours := shipped(name)).is_file():
             return ours
     except (OSError, ValueError) as error:  # a name that no file can have, or a folder that cannot be read
@@ -129,24 +124,11 @@ def _beside(path: Path, name: str) -> Path:
     raise UserError(f"{path}: key '{DEFAULTS}': expected configuration files, found {missing}")
 
 
-def _relative(path: Path) -> Path:
-    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
-
-
 def _read(path: Path) -> dict[str, Any]:
     check_readable(path, "configuration", LONGEST)
     try:
         keys = _parsed(path.read_text("utf-8"))
-    except (
-        OSError,
-        ValueError,
-        YAMLError,
-        OmegaConfBaseException,
-        RecursionError,
-        TypeError,
-        LookupError,
-        AssertionError,
-    ) as error:
+    except _DAMAGED as error:
         reason = short(str(error), 200) or "no mapping of keys"
         raise UserError(f"{path}: expected a configuration file (YAML), found {reason}") from error
     require(isinstance(keys, dict), str(path), "a mapping of keys", "a list")
@@ -161,3 +143,4 @@ def _parsed(text: str) -> object:
 
 LONGEST = 200_000
 """Maximum size of a configuration file in bytes; OmegaConf bounds the expansion of aliases."""
+_DAMAGED = (OSError, ValueError, YAMLError, OmegaConfBaseException, RecursionError, TypeError, LookupError, AssertionError)

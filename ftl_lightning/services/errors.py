@@ -31,16 +31,10 @@ def shown(value: object, most: int = 60) -> str:
 
 
 def require(condition: object, place: str, expected: str, found: object) -> None:
-    """Check a condition of the input.
-
-    Args:
-        condition: true for valid input.
-        place: file, key or argument.
-        expected: description of valid input.
-        found: the invalid input; a string is printed as it is, any other value by :func:`shown`.
+    """Check a condition of the input at a place: a file, a key or an argument.
 
     Raises:
-        UserError: ``'place: expected ..., found ...'`` unless the condition holds.
+        UserError: ``'place: expected ..., found ...'`` unless the condition holds; ``found`` by :func:`shown` unless it is a text.
     """
     if not condition:
         raise UserError(f"{place}: expected {expected}, found {found if isinstance(found, str) else shown(found)}")
@@ -48,11 +42,7 @@ def require(condition: object, place: str, expected: str, found: object) -> None
 
 @contextmanager
 def about(where: str | Path) -> Iterator[None]:
-    """Put the name of a file before an error in its content.
-
-    Raises:
-        UserError: the error of the block, in a line of at most :data:`LONGEST` characters unless the name is long.
-    """
+    """Put the name of a file before a :class:`UserError` in its content; at most :data:`LONGEST` characters for short names."""
     try:
         yield
     except UserError as error:
@@ -68,11 +58,7 @@ def mistake_behind(error: BaseException | None) -> UserError | None:
 
 
 def mistake_of_machine(error: BaseException) -> str | None:
-    """Message for an error of the machine that a user can correct: an inaccessible file, or too little memory.
-
-    Returns:
-        A single line; ``None`` for any other exception.
-    """
+    """Line for an error of the machine that a user can correct, an inaccessible file or too little memory; ``None`` for others."""
     if isinstance(error, OSError):
         where = short(str(error.filename or "a file"), 150)
         reason = error.strerror or short(str(error))
@@ -88,11 +74,6 @@ def mistake_of_machine(error: BaseException) -> str | None:
     return None
 
 
-_NO_MEMORY = (
-    "can't allocate memory",
-    "not enough memory",
-    "out of memory",
-    "Unable to allocate",
-    "Storage size calculation overflowed",
+_NO_MEMORY = (  # messages of torch and numpy
+    *("can't allocate memory", "not enough memory", "out of memory", "Unable to allocate", "Storage size calculation overflowed"),
 )
-"""Messages of torch and numpy."""

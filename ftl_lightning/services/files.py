@@ -44,15 +44,12 @@ def raised(most: int) -> int:
 
 
 def check_readable(path: str | Path, kind: str, most: int | None = None) -> int:
-    """Refuse anything but a regular file of bounded size. The file is not opened: a pipe would wait for ever.
+    """Refuse anything but a regular file of bounded size, and return its size in bytes. It is not opened: a pipe would block.
 
     Args:
         path: path of the file.
         kind: expected kind, for messages.
         most: maximum bytes; ``None`` for the limit of a file of tensors.
-
-    Returns:
-        Size in bytes.
 
     Raises:
         UserError: naming the file.
@@ -78,15 +75,10 @@ def _kind(mode: int) -> str:
 
 
 def check_unpacked(size: int, packed: int, what: str) -> None:
-    """Refuse compressed content that unpacks to far more than honest content does.
-
-    Args:
-        size: unpacked bytes.
-        packed: packed bytes.
-        what: name of the content, for messages.
+    """Refuse compressed content of ``packed`` bytes whose unpacked ``size`` is far above that of honest content.
 
     Raises:
-        UserError: naming both sizes.
+        UserError: naming the content (``what``) and both sizes.
     """
     most = min(raised(max(MOST_UNPACKED, MOST_RATIO * packed)), most_bytes())
     require(size <= most, what, f"at most {most} bytes in a file of {packed}", f"{size}; save it without compression")
@@ -107,31 +99,6 @@ def read_text(path: str | Path, kind: str, most: int = MOST_TEXT, encoding: str 
         raise UserError(f"{path}: expected a {kind} file, found one that cannot be read ({error.strerror})") from error
 
 
-def check_file(path: str | Path, key: str = "") -> None:
-    """Refuse an existing path that is no regular file: a folder, a device, a pipe, a socket, or a link to one.
-
-    Args:
-        path: file to write.
-        key: option that names the path; empty for none.
-
-    Raises:
-        UserError: naming the path.
-    """
-    _check_kind(path, key, "file")
-
-
-def check_folder(path: str | Path, key: str = "") -> None:
-    """Refuse an existing path that is no folder, as :func:`check_file`."""
-    _check_kind(path, key, "folder")
-
-
-def check_new_folder(path: str | Path, key: str = "") -> None:
-    """As :func:`check_folder`, and refuse a folder that is not empty."""
-    check_folder(path, key)
-    empty = not Path(path).is_dir() or not any(Path(path).iterdir())
-    require(empty, _named(path, key), "an empty folder or nothing there", "one with files; choose another name")
-
-
 def check_writable_file(path: str | Path, key: str = "") -> None:
     """As :func:`check_file`, and refuse an invalid name or an unwritable place.
 
@@ -142,16 +109,37 @@ def check_writable_file(path: str | Path, key: str = "") -> None:
 
 
 def check_writable_folder(path: str | Path, key: str = "") -> None:
-    """As :func:`check_folder`, and refuse an invalid name or an unwritable place."""
-    check_folder(path, key)
+    """As :func:`check_writable_file`, for a folder."""
+    check_file(path, key, "folder")
     _check_place(Path(path).absolute(), Path(path), key)
+
+
+def check_new_folder(path: str | Path, key: str = "") -> None:
+    """As :func:`check_writable_folder`, and refuse a folder that is not empty.
+
+    Raises:
+        UserError: naming the path.
+    """
+    check_writable_folder(path, key)
+    empty = not Path(path).is_dir() or not any(Path(path).iterdir())
+    require(empty, _named(path, key), "an empty folder or nothing there", "one with files; choose another name")
 
 
 def _named(path: str | Path, key: str) -> str:
     return short(f"{key}: {path}" if key else str(path), 150)
 
 
-def _check_kind(path: str | Path, key: str, kind: str) -> None:
+def check_file(path: str | Path, key: str = "", kind: str = "file") -> None:
+    """Refuse an existing path that is no regular file or no folder, but a device, a pipe, a socket, or a link to one.
+
+    Args:
+        path: path to write.
+        key: option that names the path; empty for none.
+        kind: ``'file'`` or ``'folder'``.
+
+    Raises:
+        UserError: naming the path.
+    """
     try:
         actual = _kind(Path(path).stat().st_mode)
     except FileNotFoundError:
@@ -188,14 +176,11 @@ FILES = (".npz", ".safetensors")
 
 
 def read_from(name: str) -> tuple[Kind, str]:
-    """Resolve a name of demonstrations to read.
+    """Resolve a name of demonstrations to read: their kind, and the name of the data set, the folder or the file.
 
     Args:
         name: ``'minari:NAME'``, ``'lerobot:FOLDER'``, a folder with :data:`INFO`, the name of a Minari data set unless a file has
             it, or a file.
-
-    Returns:
-        Kind, and the name of the data set, the folder or the file.
     """
     kind, rest = written_to(name)
     if kind != "file" or Path(name).suffix in FILES:
@@ -212,6 +197,4 @@ def read_from(name: str) -> tuple[Kind, str]:
 def written_to(name: str) -> tuple[Kind, str]:
     """Resolve a name of demonstrations to write by its prefix alone: ``'minari:NAME'``, ``'lerobot:FOLDER'``, or a file."""
     kind, colon, rest = name.partition(":")
-    if colon and kind in ("minari", "lerobot"):
-        return ("minari" if kind == "minari" else "lerobot"), rest
-    return "file", name
+    return (("minari" if kind == "minari" else "lerobot"), rest) if colon and kind in ("minari", "lerobot") else ("file", name)

@@ -64,7 +64,8 @@ def claim(parent: Path, name: str, new: bool) -> str:
     Raises:
         UserError: if no folder can be made.
     """
-    return next(candidate for candidate in _numbered(name) if _claimed(parent / candidate, new))
+    numbered = (f"{name}_{number}" if number else name for number in itertools.count())
+    return next(candidate for candidate in numbered if _claimed(parent / candidate, new))
 
 
 def hold(folder: Path) -> None:
@@ -75,10 +76,6 @@ def hold(folder: Path) -> None:
     """
     free = _claimed(folder, new=False)
     require(free, str(folder), "the log folder of a run that has ended", "that of a run that goes on; wait for its end")
-
-
-def _numbered(name: str) -> Iterator[str]:
-    return (f"{name}_{number}" if number else name for number in itertools.count())
 
 
 def _claimed(folder: Path, new: bool) -> bool:

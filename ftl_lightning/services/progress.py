@@ -17,10 +17,9 @@ LINES = 10
 
 
 class Advance(Protocol):
-    """Move a bar."""
+    """Move a bar on by some steps; the text ``told`` beside it, such as a loss, stays until it is replaced."""
 
-    def __call__(self, steps: int = 1, told: str = "") -> None:
-        """Move on by some steps; the text ``told`` beside the bar, such as a loss, stays until it is replaced."""
+    def __call__(self, steps: int = 1, told: str = "") -> None: ...
 
 
 @dataclass
@@ -36,7 +35,7 @@ _SCREEN = _Screen()
 
 @contextmanager
 def bar(title: str, total: int | None, done: int = 0, lines: bool = True) -> Iterator[Advance]:
-    """Show the progress of work, alone or inside another bar, which keeps moving.
+    """Show the progress of work, alone or inside another bar; yield the function to call after each step.
 
     In a terminal the bar disappears at the end, and an outermost bar leaves a line. Elsewhere an outermost bar writes lines: at the
     start, after each tenth, and at the end; inner bars write none.
@@ -46,9 +45,6 @@ def bar(title: str, total: int | None, done: int = 0, lines: bool = True) -> Ite
         total: number of steps; ``None`` if unknown.
         done: number of steps done before.
         lines: whether to write lines; otherwise the bar is visible only in a terminal.
-
-    Yields:
-        Function to call after each step.
     """
     current = _Bar(plain(title), total, done, lines and _SCREEN.depth == 0)
     opened = _SCREEN.display is None and sys.stderr.isatty()
@@ -107,7 +103,7 @@ class _Bar:
         if _SCREEN.display is not None:
             self.task = _SCREEN.display.add_task(self.title, total=self.total, completed=self.done, steps=self._steps(), told="")
         elif self.lines:
-            self._write(f"{self.title}: {self._steps()}" if self.total else self.title)
+            say(f"{self.title}: {self._steps()}" if self.total else self.title, error=True)
 
     def advance(self, steps: int = 1, told: str = "") -> None:
         before, self.done = self.done, self.done + steps
@@ -115,7 +111,7 @@ class _Bar:
         if _SCREEN.display is not None and self.task is not None:
             _SCREEN.display.update(self.task, advance=steps, steps=self._steps(), told=self.note)  # type: ignore[arg-type]
         elif self.lines and self.total and LINES * before // self.total < LINES * self.done // self.total < LINES:
-            self._write(f"{self.title}: {self._steps()}, {self._time()}{self._suffix()}")
+            say(f"{self.title}: {self._steps()}, {self._time()}", error=True)
 
     def hide(self) -> None:
         if _SCREEN.display is not None and self.task is not None:
@@ -124,18 +120,12 @@ class _Bar:
     def end(self) -> None:
         if self.lines:
             steps = f"{self.done - self.first} steps, " if self.total else ""
-            self._write(f"{self.title}: {steps}{self._time()}{self._suffix()}")
+            say(f"{self.title}: {steps}{self._time()}", error=True)
 
     def _steps(self) -> str:
         return f"{self.done}/{self.total}" if self.total else ""
 
     def _time(self) -> str:
+        """Elapsed time, and the text of the last step."""
         seconds = round(time.monotonic() - self.start)
-        return f"{seconds // 60}:{seconds % 60:02d}"
-
-    def _suffix(self) -> str:
-        return f", {self.note}" if self.note else ""
-
-    @staticmethod
-    def _write(line: str) -> None:
-        say(line, error=True)
+        return f"{seconds // 60}:{seconds % 60:02d}{self.note and f', {self.note}'}"

@@ -21,11 +21,9 @@ FRESH_SEED = 4_000_000
 
 
 def generator(device: torch.device | str, *key: int) -> torch.Generator:
-    """Random generator seeded by a key, for example ``(seed, step)``.
+    """Random generator seeded by a key of non-negative integers, for example ``(seed, step)``.
 
-    Args:
-        device: device of the generator.
-        key: non-negative integers, which are mixed, since torch keeps 32 bits of a seed on CPUs.
+    The integers are mixed, since torch keeps 32 bits of a seed on CPUs.
     """
     seed = int(np.random.SeedSequence(key).generate_state(1)[0])
     return torch.Generator(device=device).manual_seed(seed)
@@ -50,12 +48,7 @@ _ROWS = _Rows()
 
 @contextmanager
 def rows_of(rank: int, world: int) -> Iterator[None]:
-    """Draw and average over the batch of all processes within the block.
-
-    Args:
-        rank: rank of this process.
-        world: number of processes.
-    """
+    """Draw and average over the batch of all ``world`` processes within the block, in the process ``rank``."""
     before = _ROWS.rank, _ROWS.world
     _ROWS.rank, _ROWS.world = rank, world
     try:
@@ -65,15 +58,8 @@ def rows_of(rank: int, world: int) -> Iterator[None]:
 
 
 def drawn(count: int, draw: Callable[[int], Tensor]) -> Tensor:
-    """Random numbers of this process's rows ``(count, ...)``.
-
-    Args:
-        count: number of this process's rows.
-        draw: called with the total number of rows; returns as many.
-    """
-    if _ROWS.world == 1:
-        return draw(count)
-    return draw(count * _ROWS.world)[_ROWS.rank :: _ROWS.world]
+    """Random numbers of this process's rows ``(count, ...)``; ``draw`` maps the total number of rows to as many numbers."""
+    return draw(count) if _ROWS.world == 1 else draw(count * _ROWS.world)[_ROWS.rank :: _ROWS.world]
 
 
 def mean(value: Tensor) -> Tensor:

@@ -19,20 +19,13 @@ FILM = Path(__file__).parent / "film.js"
 
 
 def shipped(path: str | Path) -> Path:
-    """Resolve a path: as given, or else in the shipped folders.
+    """Resolve a path, such as ``conf/agent.yaml`` or ``pretrained/agent``: as given, or else in the shipped folders.
 
-    Args:
-        path: for example ``conf/agent.yaml`` or ``pretrained/agent``, relative to the current folder.
-
-    Returns:
-        The path; as given if neither exists, so that errors name the user's path.
+    If neither exists, the path is returned as given, so that errors name it.
     """
     path = Path(path)
-    if path.parts[:1] and path.parts[0] in FOLDERS and ".." not in path.parts and not path.exists():
-        inside = _PACKAGE / path
-        if inside.exists():
-            return inside
-    return path
+    ours = path.parts[:1] and path.parts[0] in FOLDERS and ".." not in path.parts and not path.exists()
+    return _PACKAGE / path if ours and (_PACKAGE / path).exists() else path
 
 
 def shipped_models() -> list[str]:
@@ -41,11 +34,7 @@ def shipped_models() -> list[str]:
 
 
 def list_models(baselines: bool = False) -> list[str]:
-    """Names of the shipped models for ``FewShot.from_pretrained``.
-
-    Args:
-        baselines: include baselines, such as ``baseline/cvae/agent``.
-    """
+    """Names of the shipped models for ``FewShot.from_pretrained``; with ``baselines`` also ``baseline/cvae/agent`` and so on."""
     others = sorted(str(path.parent.relative_to(MODELS)) for path in MODELS.glob("baseline/*/*/config.json"))
     return shipped_models() + (others if baselines else [])
 
@@ -90,14 +79,10 @@ EXTRAS: Mapping[str, Mapping[str, str]] = {
 
 
 def check_extra(extra: str, user: str) -> None:
-    """Require an extra's packages; nothing is imported.
-
-    Args:
-        extra: a key of :data:`EXTRAS`.
-        user: subject of the error message: what needs the packages.
+    """Require the packages of ``extra``, a key of :data:`EXTRAS`; nothing is imported.
 
     Raises:
-        UserError: with the command that installs them.
+        UserError: that ``user`` needs them, with the command that installs them.
     """
     for module, package in EXTRAS[extra].items():
         if importlib.util.find_spec(module) is None:

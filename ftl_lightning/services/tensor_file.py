@@ -55,7 +55,8 @@ def atomic(path: str | Path) -> Iterator[Path]:
         handle, temporary = _locked(path.parent, begin, path.suffix)
         yield temporary
         os.fsync(handle)
-        temporary.chmod(0o666 & ~_umask())
+        os.umask(umask := os.umask(0))
+        temporary.chmod(0o666 & ~umask)
         temporary.replace(path)
     except OSError as error:
         raise UserError(f"{path}: cannot be written ({error.strerror or error}); choose a writable place with room") from error
@@ -103,18 +104,9 @@ def alone(folder: str | Path) -> Iterator[None]:
 
 
 def visible(folder: Path, pattern: str) -> list[Path]:
-    """Sorted paths below a folder that match a pattern, without hidden files and folders.
-
-    Temporary files of :func:`atomic`, which a killed process leaves behind, are hidden.
-    """
+    """Sorted paths below a folder that match a pattern, without hidden ones such as the temporary files of :func:`atomic`."""
     paths = sorted(folder.glob(pattern))
     return [path for path in paths if not any(part.startswith(".") for part in path.relative_to(folder).parts)]
-
-
-def _umask() -> int:
-    value = os.umask(0)
-    os.umask(value)
-    return value
 
 
 def write_text(path: str | Path, text: str) -> None:
@@ -148,15 +140,7 @@ def save_tensors(
 
 
 def load_tensors(path: str | Path, kind: str, version: int = FORMAT) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Read a file of :func:`save_tensors`.
-
-    Args:
-        path: the file.
-        kind: expected kind.
-        version: version of this kind's format.
-
-    Returns:
-        Tensors by name, and the header.
+    """Read a file of :func:`save_tensors`: tensors by name, and the header.
 
     Raises:
         UserError: for a file that is missing, damaged, or of another kind.
@@ -168,14 +152,7 @@ def load_tensors(path: str | Path, kind: str, version: int = FORMAT) -> tuple[di
 
 
 def load_header(path: str | Path, kind: str) -> tuple[dict[str, tuple[int, ...]], Any]:
-    """Read the header and the shapes of a file of tensors, without the tensors and without the checks of :func:`check_kind`.
-
-    Args:
-        path: the file.
-        kind: expected kind, for messages.
-
-    Returns:
-        Shapes of tensors by name, and the header as parsed JSON.
+    """Read shapes by name and the header of a file of tensors, without the tensors and without the checks of :func:`check_kind`.
 
     Raises:
         UserError: for a file that is missing or damaged.
@@ -189,7 +166,7 @@ def load_header(path: str | Path, kind: str) -> tuple[dict[str, tuple[int, ...]]
 @contextmanager
 def _opened(path: Path, kind: str) -> Iterator[tuple[Any, str]]:
     """Open a file of tensors; yield it with the text of its header."""
-    check_header(path, kind, check_readable(path, kind))
+    _check_header(path, kind, check_readable(path, kind))
     try:
         with safetensors.safe_open(path, framework="pt") as file:
             yield file, (file.metadata() or {}).get(_HEADER, "{}")
@@ -226,17 +203,8 @@ def kind_of(content: bytes) -> str:
         return ""
 
 
-def check_header(path: Path, kind: str, size: int) -> None:
-    """Refuse a safetensors file whose header is too long or names too many tensors: reading it takes minutes.
-
-    Args:
-        path: the file.
-        kind: expected kind.
-        size: size in bytes.
-
-    Raises:
-        UserError: naming the file.
-    """
+def _check_header(path: Path, kind: str, size: int) -> None:
+    """Refuse a safetensors file of ``size`` bytes whose header is too long or names too many tensors: reading it takes minutes."""
     with path.open("rb") as file:
         length = int.from_bytes(file.read(8), "little")
         most = raised(MOST_HEADER)

@@ -11,7 +11,6 @@ import re
 import sys
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from typing import Any
 from unicodedata import category
 
@@ -28,27 +27,18 @@ def line(text: str) -> str:
     return plain(" ".join(text.split()))
 
 
-@dataclass
-class _Voice:
-    silent: bool = False
-
-
-_VOICE = _Voice()
+_silent = False
 
 
 def silence() -> None:
     """Print nothing from now on: of several processes of a run only the first prints."""
-    _VOICE.silent = True
+    global _silent
+    _silent = True
 
 
 def say(*parts: object, error: bool = False) -> None:
-    """Print a text by :func:`plain`, at once.
-
-    Args:
-        parts: values, separated by spaces.
-        error: whether to print to standard error.
-    """
-    if not _VOICE.silent:
+    """Print values by :func:`plain` at once, separated by spaces, to standard output or standard error."""
+    if not _silent:
         print(*(plain(str(part)) for part in parts), file=sys.stderr if error else sys.stdout, flush=True)
 
 
@@ -90,23 +80,10 @@ def counted(count: int, what: str) -> str:
 
 
 _LATEX = str.maketrans(
-    {
-        "\\": r"\textbackslash{}",
-        "{": r"\{",
-        "}": r"\}",
-        "$": r"\$",
-        "&": r"\&",
-        "%": r"\%",
-        "#": r"\#",
-        "_": r"\_",
-        "^": r"\textasciicircum{}",
-        "~": r"\textasciitilde{}",
-        "`": r"\textasciigrave{}",
-        "|": r"\textbar{}",
-        "±": r"$\pm$",
-        "<": "$<$",
-        ">": "$>$",
-    }
+    {letter: f"\\{letter}" for letter in "{}$&%#_"}
+    | {letter: f"${letter}$" for letter in "<>"}
+    | {"\\": r"\textbackslash{}", "^": r"\textasciicircum{}", "~": r"\textasciitilde{}", "`": r"\textasciigrave{}"}
+    | {"|": r"\textbar{}", "±": r"$\pm$"}
 )
 _MARKDOWN = re.compile(
     r"""[\\`*|~${}>&]
@@ -124,10 +101,7 @@ MOST_DRAWN = 120
 
 
 def latex(text: str) -> str:
-    """Escape a text for LaTeX in one line, without commands and formulas.
-
-    A table row that begins with a bracket or an asterisk needs an empty group before it, see :func:`latex_row`.
-    """
+    """Escape a text for LaTeX in one line, without commands and formulas; for a row of a table see :func:`latex_row`."""
     return line(text).translate(_LATEX)
 
 
@@ -148,8 +122,6 @@ def script_json(content: Any) -> str:
 
 
 def figure_text(text: str) -> str:
-    """Escape a text for a figure in one line: matplotlib reads text between dollars as a formula, and a legend omits names that
-    begin with ``_``.
-    """
+    """Escape a text for a figure in one line. Matplotlib reads dollars as formulas; legends omit names that begin with ``_``."""
     label = short(line(text), MOST_DRAWN).replace("$", r"\$")
     return f" {label}" if label.startswith("_") else label

@@ -38,8 +38,7 @@ _vouched: contextvars.ContextVar[frozenset[str]] = contextvars.ContextVar("vouch
 def search_path() -> list[str]:
     """Python's path without the current folder, unless the package is in it.
 
-    Python adds the current folder for ``-c``, for ``-m`` (see ``__main__``), in a notebook, and for an empty part of
-    ``PYTHONPATH``.
+    Python adds the folder for ``-c``, for ``-m`` (see ``__main__``), in notebooks, and for an empty part of ``PYTHONPATH``.
     """
     here = Path.cwd()
     python_path = os.environ.get("PYTHONPATH")
@@ -93,11 +92,7 @@ def vouching(names: Iterable[str]) -> Iterator[None]:
 
 @contextmanager
 def person(verb: str, arguments: Arguments) -> Iterator[Arguments]:
-    """Trust names in a command line, and remove the current folder from Python's path unless a module in it is named.
-
-    Args:
-        verb: the verb.
-        arguments: arguments after the verb.
+    """Trust names in a verb's arguments, and remove the current folder from Python's path unless a module in it is named.
 
     Yields:
         The arguments without :data:`OPTION`.
@@ -143,11 +138,7 @@ def _named(verb: str, arguments: Arguments) -> set[str]:
 
 
 def check_classes(keys: object, where: str) -> None:
-    """Refuse a configuration with a class of a module that is neither installed nor trusted.
-
-    Args:
-        keys: content of a configuration file, nested mappings and lists.
-        where: the file.
+    """Refuse the content of a file (``where``) with a class of a module that is neither installed nor trusted.
 
     Raises:
         UserError: with the file, the key and the module.

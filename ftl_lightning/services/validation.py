@@ -12,14 +12,13 @@ import numbers
 import os
 import types
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from ftl_lightning.services.errors import UserError, about, require, short, shown
 from ftl_lightning.services.files import MOST_TEXT, check_readable
-from ftl_lightning.services.option_groups import groups_of, replaced
 
 if TYPE_CHECKING:
     import torch
@@ -43,13 +42,7 @@ LARGEST_FACTOR = 1e6
 
 
 def check_range(key: str, value: float, least: float = -math.inf, most: float = math.inf) -> None:
-    """Refuse a number that is out of range or not finite.
-
-    Args:
-        key: name of the option.
-        value: given value.
-        least: minimum.
-        most: maximum.
+    """Refuse a number that is not finite or not from ``least`` to ``most``.
 
     Raises:
         UserError: with key, range and value.
@@ -83,23 +76,14 @@ T = TypeVar("T")
 
 
 def read_json(path: Path, kind: str = "JSON") -> Any:
-    """Read a JSON file.
-
-    Raises:
-        UserError: naming the file, as :func:`parse_json`; also if it is missing, too long, a device or a pipe.
-        OSError: if it cannot be read.
-    """
+    """Read a JSON file; errors as :func:`parse_json` and :func:`~ftl_lightning.services.files.check_readable`."""
     check_readable(path, kind.removeprefix("a ").removesuffix(" file"), MOST_TEXT)
     with about(path):
         return parse_json(path.read_bytes(), kind)
 
 
 def parse_json(text: str | bytes, kind: str = "JSON") -> Any:
-    """Parse a JSON text.
-
-    Args:
-        text: the text.
-        kind: expected kind, for messages.
+    """Parse a JSON text; ``kind`` is the expected kind, for messages.
 
     Raises:
         UserError: for damaged text, repeated keys, numbers that are not finite, invalid Unicode, or nesting deeper than
@@ -156,9 +140,9 @@ def from_mapping(kind: Callable[..., T], content: object, key: str, *given: obje
     if not isinstance(content, Mapping):
         raise UserError(f"{_place(key)}: expected a mapping, found {shown(content)}")
     for name in content:
-        require(name in names, _place(key, name), f"one of {short(', '.join(names), 120)}", "another key")
+        require(name in names, _place(_joined(key, name)), f"one of {short(', '.join(names), 120)}", "another key")
     for name in needed.intersection(names):
-        require(name in content, _place(key, name), "a value", "none")
+        require(name in content, _place(_joined(key, name)), "a value", "none")
     return kind(*given, **{name: check_type(value, hints[name], _joined(key, name)) for name, value in content.items()})
 
 
@@ -219,9 +203,7 @@ def _joined(key: str, name: object) -> str:
     return f"{key}.{short(str(name))}" if key else short(str(name))
 
 
-def _place(key: str, name: object = None) -> str:
-    """Location of a key, or of a name in it, for messages."""
-    key = key if name is None else _joined(key, name)
+def _place(key: str) -> str:
     return f"key {key!r}" if key else "content"
 
 
@@ -247,13 +229,7 @@ MOST_NAMES = 8
 
 
 def check_whole(key: str, value: object, least: int, most: int | None = LARGEST) -> int:
-    """Check and return a whole number.
-
-    Args:
-        key: name of the argument.
-        value: value of the argument.
-        least: minimum.
-        most: maximum; ``None`` for any.
+    """Check and return a whole number from ``least`` to ``most``; ``None`` for no maximum.
 
     Raises:
         UserError: for anything else, ``True`` included.
@@ -268,21 +244,47 @@ def check_whole(key: str, value: object, least: int, most: int | None = LARGEST)
 
 
 def check_text(key: str, value: object, example: str) -> None:
-    """Refuse a value that is not a text.
-
-    Raises:
-        UserError: with an example.
-    """
+    """Refuse a value that is not a text by a :class:`UserError` with an example."""
     require(isinstance(value, str), key, f"a text, such as {shown(example, 40)}", shown(value))
 
 
 def check_path(key: str, value: object, what: str) -> None:
-    """Refuse a value that is not a path.
+    """Refuse a value that is not a path by a :class:`UserError` with the expected kind of path."""
+    require(isinstance(value, str | os.PathLike), key, what, shown(value))
+
+
+def groups_of(places: Mapping[str, str]) -> list[str]:
+    """Unique names of the groups of options.
+
+    Args:
+        places: grouped options ``'group.option'`` by flat name, as in results, checkpoints and the Python API.
+    """
+    return list(dict.fromkeys(place.partition(".")[0] for place in places.values()))
+
+
+def flat(groups: Mapping[str, object], places: Mapping[str, str]) -> dict[str, Any]:
+    """Flatten groups by name to options by flat name; ``places`` as in :func:`groups_of`.
 
     Raises:
-        UserError: with the expected kind of path.
+        UserError: for an object that is not a group.
     """
-    require(isinstance(value, str | os.PathLike), key, what, shown(value))
+    options = {}
+    for name, place in places.items():
+        group, _, option = place.partition(".")
+        if not hasattr(groups[group], option):
+            raise UserError(f"model.{group}: expected a group of options with {option!r}, found {shown(groups[group])}")
+        options[name] = getattr(groups[group], option)
+    return options
+
+
+def replaced(settings: S, options: Mapping[str, Any], places: Mapping[str, str]) -> S:
+    """Copy of a dataclass of options and groups, with new options by flat name; ``places`` as in :func:`groups_of`."""
+    changes = {name: value for name, value in options.items() if name not in places}
+    in_groups: dict[str, dict[str, Any]] = {}
+    for name in options.keys() & places.keys():
+        group, _, option = places[name].partition(".")
+        in_groups.setdefault(group, {})[option] = options[name]
+    return replace(settings, **changes, **{group: replace(getattr(settings, group), **new) for group, new in in_groups.items()})
 
 
 def changed(
@@ -295,7 +297,7 @@ def changed(
         settings: current settings.
         changes: changed settings by name.
         beside: other arguments of the method.
-        places: grouped options ``'group.option'`` by flat name.
+        places: see :func:`groups_of`.
 
     Raises:
         UserError: for an unknown name, with the known names, or a value of another type.
@@ -357,7 +359,9 @@ def device_named(name: object) -> "torch.device":
     """
     import torch
 
-    expected = f"one that this machine has, {' or '.join(_devices())}"
+    cuda = [f"cuda:{number}" for number in range(torch.cuda.device_count())] if torch.cuda.is_available() else []
+    known = ["cpu", *cuda, *(["mps"] if torch.backends.mps.is_available() else [])]
+    expected = f"one that this machine has, {' or '.join(known)}"
     if not isinstance(name, str | torch.device):
         raise UserError(f"device: expected {expected}, found {shown(name)}")
     try:
@@ -365,15 +369,8 @@ def device_named(name: object) -> "torch.device":
         torch.ones(1, device=device).cpu()  # a valid name may be unavailable
     except (RuntimeError, AssertionError, NotImplementedError) as error:
         # An available device may be out of memory or broken.
-        if str(name) in _devices() or (str(name) == "cuda" and torch.cuda.is_available()):
+        if str(name) in known or (str(name) == "cuda" and torch.cuda.is_available()):
             reason = short(next(iter(str(error).splitlines()), "") or type(error).__name__)
             raise UserError(f"device: expected {name} to compute, found that it cannot: {reason}") from error
         raise UserError(f"device: expected {expected}, found {shown(name)}") from error
     return device
-
-
-def _devices() -> list[str]:
-    import torch
-
-    cuda = [f"cuda:{number}" for number in range(torch.cuda.device_count())] if torch.cuda.is_available() else []
-    return ["cpu", *cuda, *(["mps"] if torch.backends.mps.is_available() else [])]

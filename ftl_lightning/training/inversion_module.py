@@ -20,9 +20,9 @@ from ftl_lightning.igm.settings import (
     ModeOptions,
     WeightOptions,
 )
-from ftl_lightning.services.option_groups import flat, groups_of
 from ftl_lightning.services.progress import bar
 from ftl_lightning.services.text import counted
+from ftl_lightning.services.validation import flat, groups_of
 from ftl_lightning.training.adaptation import Adaptation, LearnerAdaptation
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.in_processes import learned_in_processes

@@ -23,10 +23,9 @@ from ftl_lightning.igm.point import Point
 from ftl_lightning.networks.image_encoder import ImageEncoders
 from ftl_lightning.networks.text_encoder import EMPTY
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.option_groups import groups_of
 from ftl_lightning.services.randomness import generator, mean, rows_of
 from ftl_lightning.services.tensor_file import check_finite
-from ftl_lightning.services.validation import LARGEST_FACTOR, LARGEST_RATE, check_factor, check_range
+from ftl_lightning.services.validation import LARGEST_FACTOR, LARGEST_RATE, check_factor, check_range, groups_of
 from ftl_lightning.training.checkpoint import SIGNATURE, Random, check_parameters, check_restored, check_signature
 from ftl_lightning.training.concept_model import ConceptModel, joined_vectors
 from ftl_lightning.training.data import Batch, PretrainingData
@@ -70,7 +69,7 @@ class Pretraining(pl.LightningModule, ABC, Generic[M]):
     model: M
     raw: M
     flat: ClassVar[Mapping[str, str]] = {}
-    """Grouped options ``'group.option'`` by flat name, see :mod:`ftl_lightning.services.option_groups`."""
+    """Grouped options ``'group.option'`` by flat name, see :func:`ftl_lightning.services.validation.groups_of`."""
     form: str = ""
     """Suffix of the method's name in tables, if it has several forms."""
     variant: str = ""

@@ -22,7 +22,7 @@ from ftl_lightning.methods.ftl_igm import pretraining
 from ftl_lightning.methods.ftl_igm.codes import Codes
 from ftl_lightning.methods.ftl_igm.pretraining import PRETRAINING, PretrainingModule
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.option_groups import flat, groups_of, replaced
+from ftl_lightning.services.validation import flat, groups_of, replaced
 from tests.conftest import CONF, inversion_module
 
 OBJECTS = CONF / "object_rearrangement.yaml"

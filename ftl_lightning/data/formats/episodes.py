@@ -61,26 +61,21 @@ def to_episodes(demonstrations: Demonstrations) -> Iterator[Episode]:
     scenes = demonstrations.scenes
     for row, (length, text) in enumerate(zip(demonstrations.lengths.tolist(), demonstrations.concepts, strict=True)):
         observed = {
-            name: values[row, :length] if name in demonstrations.per_step else values[row].expand(length, *values[row].shape)
+            name: (
+                values[row, :length] if name in demonstrations.per_step else values[row].expand(length, *values[row].shape)
+            ).numpy()
             for name, values in demonstrations.observed.items()
         }
-        yield Episode(
-            demonstrations.states[row, :length].numpy(),
-            {name: values.numpy() for name, values in observed.items()},
-            text,
-            None if scenes is None else scenes[row].numpy(),
-        )
+        scene = None if scenes is None else scenes[row].numpy()
+        yield Episode(demonstrations.states[row, :length].numpy(), observed, text, scene)
 
 
 def from_episodes(episodes: Sequence[Episode], given: Metadata) -> Contents:
-    """Invert :func:`to_episodes`, padding to the longest with the last state.
+    """Invert :func:`to_episodes`, padding to the longest with the last state; attributes are not validated.
 
     Args:
         episodes: at least one, all with the same columns and observed features.
         given: attributes stored beside the episodes; features that were not read are ignored.
-
-    Returns:
-        Attributes of demonstrations, not validated yet.
 
     Raises:
         UserError: without episodes, or if padding needs far more memory than honest data do.
@@ -114,15 +109,10 @@ def from_episodes(episodes: Sequence[Episode], given: Metadata) -> Contents:
 
 
 def check_names(demonstrations: Demonstrations, reserved: str, place: str) -> None:
-    """Refuse names of observed features that another format cannot hold.
-
-    Args:
-        demonstrations: demonstrations to write.
-        reserved: name of the states in the format.
-        place: target, for messages.
+    """Refuse names of observed features that a format cannot hold, whose states are named ``reserved``.
 
     Raises:
-        UserError: naming the feature.
+        UserError: naming the feature, at the place given.
     """
     expected = f"the name of an observed feature other than {reserved!r} and without '/'"
     for name in demonstrations.observed:

@@ -41,11 +41,7 @@ Tell = Callable[[], None]
 
 
 def write_safetensors(demonstrations: Demonstrations, name: str) -> None:
-    """Write a safetensors file, whole or not at all; the same demonstrations give the same bytes.
-
-    Raises:
-        UserError: if the file cannot be written.
-    """
+    """Write a safetensors file, whole or not at all; the same demonstrations give the same bytes."""
     tensors = demonstrations.tensors
     images = {key: values for key, values in tensors.items() if values.dtype == torch.uint8}
     header = {**_header(demonstrations), "provenance": dict(demonstrations.provenance)}
@@ -66,11 +62,7 @@ def read_safetensors(name: str) -> Contents:
 
 
 def write_npz(demonstrations: Demonstrations, name: str) -> None:
-    """Write an ``.npz`` file without compression and without provenance, whole or not at all.
-
-    Raises:
-        UserError: if the file cannot be written.
-    """
+    """Write an ``.npz`` file without compression and without provenance, whole or not at all."""
     arrays: dict[str, Any] = {key: values.detach().cpu().numpy() for key, values in demonstrations.tensors.items()}
     arrays |= {key: np.array(value, dtype=np.str_) for key, value in _header(demonstrations).items()}
     with atomic(name) as temporary, temporary.open("wb") as file:
@@ -124,11 +116,7 @@ def _header(demonstrations: Demonstrations) -> dict[str, Any]:
 
 
 def _contents(tensors: dict[str, Tensor], header: Mapping[str, Any]) -> Contents:
-    """Attributes of demonstrations, with defaults for missing keys.
-
-    Raises:
-        UserError: naming the key, for a value of another type.
-    """
+    """Attributes of demonstrations, with defaults for missing keys."""
     names = short(", ".join(tensors)) or "nothing"
     require("states" in tensors, "key 'states'", "(demo, time, state)", f"only {names}")
     states = tensors["states"]
@@ -159,19 +147,7 @@ def _compressed(images: Tensor) -> Tensor:
 
 
 def _decompressed(key: str, packed: Tensor | None, shape: tuple[int, ...], leading: tuple[int, ...]) -> Tensor:
-    """Decompress images of a file.
-
-    Memory is bounded: nothing beyond the shape is decompressed.
-
-    Args:
-        key: key of the images in the file.
-        packed: ``(byte,)``, the tensor of this key.
-        shape: shape in the header.
-        leading: expected first sizes, those of the states.
-
-    Raises:
-        UserError: naming the key, for an impossible shape or damaged bytes.
-    """
+    """Decompress images ``(byte,)`` to a shape that begins with ``leading``; nothing beyond the shape is decompressed."""
     place = f"key {short(key)!r}"
     if packed is None or not key.startswith(OBSERVED) or packed.dtype != torch.uint8 or packed.dim() != 1:
         actual = "nothing" if packed is None else f"{str(packed.dtype).removeprefix('torch.')} of shape {tuple(packed.shape)}"

@@ -23,15 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ftl_lightning.data.demonstrations import FORMATS, Contents, Demonstrations, Format
-from ftl_lightning.data.formats.episodes import (
-    Episode,
-    Metadata,
-    check_names,
-    from_episodes,
-    measured,
-    metadata,
-    to_episodes,
-)
+from ftl_lightning.data.formats.episodes import Episode, Metadata, check_names, from_episodes, measured, metadata, to_episodes
 from ftl_lightning.services.errors import UserError, about, require, short, shown
 from ftl_lightning.services.files import INFO, check_new_folder, read_text
 from ftl_lightning.services.shipped import check_extra
@@ -85,11 +77,10 @@ def read_lerobot(folder: str | Path, part: str = "", observed: Sequence[str] | N
             is incomplete.
     """
     with about(folder):
-        return Demonstrations(**read_contents(folder, part, observed))
+        return Demonstrations(**_contents(folder, part, observed))
 
 
-def read_contents(folder: str | Path, part: str = "", observed: Sequence[str] | None = None) -> Contents:
-    """Read the attributes of demonstrations without validating them. Arguments and errors as in :func:`read_lerobot`."""
+def _contents(folder: str | Path, part: str = "", observed: Sequence[str] | None = None) -> Contents:
     check_extra("lerobot", f"{folder}: a LeRobot data set")
     from ftl_lightning.data.formats.parquet import read_columns
 
@@ -98,8 +89,7 @@ def read_contents(folder: str | Path, part: str = "", observed: Sequence[str] | 
     with about(root):
         part = _part(features, part)
         names = _observed(features, part, observed)
-    written = (root / METADATA).is_file()
-    given = Metadata()
+    given, written = Metadata(), (root / METADATA).is_file()
     if written:
         content = read_json(root / METADATA)
         with about(root / METADATA):
@@ -158,8 +148,8 @@ def _feature(key: str, fields: Mapping[str, Any]) -> _Feature:
     if isinstance(names, dict) and len(names) == 1:  # {"motors": [...]}, as in older data sets
         (names,) = names.values()
     if not isinstance(names, list) or len(names) != prod(shape) or not all(isinstance(name, str) for name in names):
-        names = None
-    return _Feature(feature.dtype, shape, None if names is None else tuple(names))
+        return _Feature(feature.dtype, shape)
+    return _Feature(feature.dtype, shape, tuple(names))
 
 
 def _part(features: Mapping[str, _Feature], part: str) -> str:
@@ -356,4 +346,4 @@ def _new_folder(folder: Path) -> Iterator[Path]:
         raise UserError(f"{folder}: cannot be written ({error.strerror or error}); choose a writable place with room") from error
 
 
-FORMATS["lerobot"] = Format(read_contents, write_lerobot)
+FORMATS["lerobot"] = Format(_contents, write_lerobot)

@@ -17,26 +17,15 @@ from typing import Any
 import numpy as np
 
 from ftl_lightning.data.demonstrations import FORMATS, Contents, Demonstrations, Format
-from ftl_lightning.data.formats.episodes import (
-    Episode,
-    Metadata,
-    check_names,
-    from_episodes,
-    measured,
-    metadata,
-    to_episodes,
-)
+from ftl_lightning.data.formats.episodes import Episode, Metadata, check_names, from_episodes, measured, metadata, to_episodes
 from ftl_lightning.data.recording import PART, feature_parts, states_part
 from ftl_lightning.services.errors import UserError, about, require, short
 from ftl_lightning.services.shipped import check_extra
 from ftl_lightning.services.validation import from_mapping
 
-CONCEPT = "concept"
-"""Key of an episode's text, see this module."""
-SCENE = "scene"
-"""Key of an episode's scene."""
-_HEADER = "ftl_lightning"
-"""Metadata key of attributes that only :func:`write_minari` knows."""
+CONCEPT, SCENE = "concept", "scene"
+"""Keys of an episode's text and scene, see this module."""
+_HEADER = "ftl_lightning"  # metadata key of attributes that only write_minari knows
 
 
 def read_minari(name: str, part: str = "", observed: Sequence[str] | None = None) -> Demonstrations:
@@ -55,11 +44,10 @@ def read_minari(name: str, part: str = "", observed: Sequence[str] | None = None
         UserError: naming the data set, if it is not installed, damaged or empty, or its observations are no vectors.
     """
     with about(name):
-        return Demonstrations(**read_contents(name, part, observed))
+        return Demonstrations(**_contents(name, part, observed))
 
 
-def read_contents(name: str, part: str = "", observed: Sequence[str] | None = None) -> Contents:
-    """Read the attributes of demonstrations without validating them. Arguments and errors as in :func:`read_minari`."""
+def _contents(name: str, part: str = "", observed: Sequence[str] | None = None) -> Contents:
     check_extra("minari", f"{name}: expected a file, found none; a Minari data set of this name")
     import minari
 
@@ -74,10 +62,8 @@ def read_contents(name: str, part: str = "", observed: Sequence[str] | None = No
         if part not in ("", PART):  # names and units are those of the states that were written
             given = replace(given, state_names=None, state_units=None)
         texts = [_text(entry) for entry in dataset.storage.get_episode_metadata(dataset.episode_indices)]
-        default = _text(attributes) or name
-        episodes = [
-            _episode(episode, part, features, text or default, written) for episode, text in zip(dataset, texts, strict=True)
-        ]
+        texts = [text or _text(attributes) or name for text in texts]
+        episodes = [_episode(episode, part, features, text, written) for episode, text in zip(dataset, texts, strict=True)]
     except FileNotFoundError as error:
         message = "expected a file or an installed Minari data set, found neither; see: minari list local"
         raise UserError(f"{name}: {message}") from error
@@ -140,7 +126,7 @@ def write_minari(demonstrations: Demonstrations, name: str) -> None:
     buffers = []
     for episode in to_episodes(demonstrations):
         steps = len(episode.states) - 1
-        infos = {CONCEPT: episode.concept} if episode.scene is None else {CONCEPT: episode.concept, SCENE: episode.scene}
+        infos = {CONCEPT: episode.concept} | ({} if episode.scene is None else {SCENE: episode.scene})
         features = {PART: list(episode.states), **{key: list(values) for key, values in episode.observed.items()}}
         buffers.append(
             EpisodeBuffer(
@@ -162,4 +148,4 @@ def write_minari(demonstrations: Demonstrations, name: str) -> None:
         raise UserError(f"{name}: cannot be written as a Minari data set such as strokes/test-v0 ({error})") from error
 
 
-FORMATS["minari"] = Format(read_contents, write_minari)
+FORMATS["minari"] = Format(_contents, write_minari)

@@ -24,11 +24,10 @@ _DAMAGED = (pa.ArrowException, OSError, ValueError, TypeError, KeyError, IndexEr
 def read_columns(
     root: Path, pattern: str, shapes: Mapping[str, tuple[int, ...]], whole: Collection[str]
 ) -> dict[str, NDArray[Any]]:
-    """Read and concatenate columns of files.
+    """Read and concatenate columns of the files below ``root`` that match a pattern.
 
     Args:
-        root: folder.
-        pattern: pattern of the files in the folder.
+        root, pattern: folder, and pattern of its files.
         shapes: shape of a row of each column, by name; a shape of one number may be stored without a list.
         whole: names of columns of whole numbers (int64).
 
@@ -56,12 +55,7 @@ def read_columns(
 
 
 def read_texts(path: Path, number: str, name: str) -> dict[int, str]:
-    """Read texts by number.
-
-    Args:
-        path: the file.
-        number: column of whole numbers.
-        name: column of texts, or the only such column under any name, since pandas names an index.
+    """Read texts by number, from the columns ``number`` and ``name``, or the only texts under any name: pandas names an index.
 
     Raises:
         UserError: naming the file, if it is missing, damaged, too large, or lacks the columns.
@@ -125,11 +119,7 @@ def _opened(path: Path) -> Iterator[pq.ParquetFile]:
 
 
 def _checked_size(path: Path, file: pq.ParquetFile, shapes: Mapping[str, tuple[int, ...]]) -> int:
-    """Unpacked bytes of columns.
-
-    Raises:
-        UserError: if a column is missing or holds more numbers than its shape, which could exhaust memory.
-    """
+    """Unpacked bytes of columns, which must exist and hold the numbers of their shapes: more could exhaust memory."""
     names, size = file.schema_arrow.names, 0
     paths = [file.schema.column(index).path for index in range(len(file.schema))]
     for name, shape in shapes.items():

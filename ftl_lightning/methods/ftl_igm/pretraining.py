@@ -12,9 +12,8 @@ from ftl_lightning.methods.ftl_igm.codes import Codes
 from ftl_lightning.methods.ftl_igm.model import DiffusionConfig, GenerativeModel
 from ftl_lightning.networks import PAPER_SIZE
 from ftl_lightning.services.errors import UserError, short
-from ftl_lightning.services.option_groups import flat, groups_of
 from ftl_lightning.services.randomness import drawn
-from ftl_lightning.services.validation import MOST_TOGETHER, check_count, check_factor, check_range
+from ftl_lightning.services.validation import MOST_TOGETHER, check_count, check_factor, check_range, flat, groups_of
 from ftl_lightning.training.data import Batch, PretrainingData
 from ftl_lightning.training.model_config import ModelConfig, Prepared
 from ftl_lightning.training.pretraining import Pretraining
