@@ -43,12 +43,7 @@ class _Share:
 
 
 def learned_in_processes(
-    model: str,
-    device: torch.device,
-    demonstrations: Demonstrations,
-    settings: InversionSettings,
-    steps: int,
-    processes: int,
+    model: str, device: torch.device, demonstrations: Demonstrations, settings: InversionSettings, steps: int, processes: int
 ) -> dict[str, Concept]:
     """Learn the concepts of the demonstrations in several processes.
 
@@ -75,10 +70,7 @@ def learned_in_processes(
             for first in range(min(processes, len(names)))
         ]
         # Spawned, since a forked process would share threads and devices.
-        with (
-            ProcessPoolExecutor(len(shares), multiprocessing.get_context("spawn")) as pool,
-            bar("concepts", len(names)) as advance,
-        ):
+        with ProcessPoolExecutor(len(shares), multiprocessing.get_context("spawn")) as pool, bar("concepts", len(names)) as advance:
             running = {pool.submit(_learn, share): len(share.concepts) for share in shares}
             try:
                 for ended in as_completed(running):

@@ -259,11 +259,7 @@ def quickly(settings: InversionSettings) -> InversionSettings:
 
 
 def leave_one_out(
-    model: Invertible,
-    demonstrations: Demonstrations,
-    settings: InversionSettings,
-    steps: int,
-    tell: Tell = lambda loss: None,
+    model: Invertible, demonstrations: Demonstrations, settings: InversionSettings, steps: int, tell: Tell = lambda loss: None
 ) -> LeaveOneOut:
     """Learn the concept from subsets, in one batch, and measure each on the left-out demonstrations.
 

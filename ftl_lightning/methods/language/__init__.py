@@ -15,9 +15,4 @@ def _adaptation() -> "type[Adaptation]":
     return LanguageAdaptation
 
 
-METHOD = Method(
-    name="language",
-    kind=OURS.kind,
-    adaptation=_adaptation,
-    configurations="conf",
-)
+METHOD = Method(name="language", kind=OURS.kind, adaptation=_adaptation, configurations="conf")

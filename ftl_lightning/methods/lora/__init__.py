@@ -16,9 +16,4 @@ def _adaptation() -> "type[Adaptation]":
     return FineTuning
 
 
-METHOD = Method(
-    name=FINE_TUNED,
-    kind=OURS.kind,
-    adaptation=_adaptation,
-    configurations="conf",
-)
+METHOD = Method(name=FINE_TUNED, kind=OURS.kind, adaptation=_adaptation, configurations="conf")
