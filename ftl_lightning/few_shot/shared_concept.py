@@ -52,10 +52,6 @@ def write_folder(
     """Write the folder of a concept; an existing card is kept.
 
     Args:
-        folder: folder to write.
-        model: the concept's model.
-        concept: learned concept.
-        tuned: settings of sampling.
         known_as: public name of the model; empty without one.
         demonstrations: demonstrations to include; ``None`` for none.
     """
@@ -76,7 +72,6 @@ def read_folder(folder: Path, name: str, space: str) -> Concept:
 
     Args:
         folder: local or downloaded folder.
-        name: name given by the user, for messages.
         space: concept space of the model, see :func:`~ftl_lightning.igm.composition.space_of`.
 
     Raises:
@@ -105,7 +100,6 @@ def card(path: Path, known_as: str, shown: str, with_demonstrations: bool) -> st
     """Card with the Hub's metadata.
 
     Args:
-        path: the concept's file.
         known_as: public name of the model; empty without one.
         shown: file name of the film or picture; empty for none.
         with_demonstrations: whether the folder includes demonstrations.

@@ -286,14 +286,7 @@ def file_name(concept: str) -> str:
 
 
 def _expect_shapes(tensors: Mapping[str, Tensor]) -> None:
-    """Check that the tensors of a concept are float32 with consistent shapes.
-
-    Args:
-        tensors: ``embeddings`` ``(K, knots, n)``, ``weights`` ``(K,)``; optionally :data:`MODES` and :data:`COMPOSING`.
-
-    Raises:
-        UserError: naming the first tensor with a wrong shape or dtype.
-    """
+    """Check that the tensors of a concept are float32 with consistent shapes."""
     shape = tuple(tensors["embeddings"].shape)
     if len(shape) != 3 or not all(shape):
         raise UserError(f"key 'embeddings': expected shape (K, knots, n), found {shape}")

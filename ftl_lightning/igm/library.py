@@ -135,11 +135,7 @@ class Library(Shown):
 
 
 def table(entries: Sequence[Entry]) -> str:
-    """Table of concepts in aligned columns under :data:`HEADINGS`.
-
-    Args:
-        entries: entries of a :class:`Library`.
-    """
+    """Table of concepts in aligned columns under :data:`HEADINGS`."""
     rows = [HEADINGS, *(entry.cells for entry in entries)]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return "\n".join("  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows)
@@ -211,11 +207,6 @@ def library(model: str, training: Sequence[str], own: Path | None = None, folder
 
 def concept_files(names: Iterable[str], folder: Path, place: str) -> dict[str, Path]:
     """Output files of learned concepts by name.
-
-    Args:
-        names: names of the concepts.
-        folder: folder to write.
-        place: name of the option, for messages.
 
     Raises:
         UserError: for two names with the same file, or a file that cannot be written.

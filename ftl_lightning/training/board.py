@@ -63,12 +63,7 @@ class LearningRate(pl.Callback):
 
 
 def rates(module: pl.LightningModule, optimizer: Optimizer) -> dict[str, float]:
-    """Learning rates by tag.
-
-    Args:
-        module: module with the parameters.
-        optimizer: optimiser of the parameters.
-    """
+    """Learning rates by tag."""
     groups: list[dict[str, Any]] = optimizer.param_groups
     if len(groups) == 1:
         return {TAG: float(groups[0]["lr"])}

@@ -43,11 +43,7 @@ class WholeCheckpoints(TorchCheckpointIO):
     """
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
-        """Write a checkpoint atomically.
-
-        Raises:
-            UserError: if the folder cannot be written or the disk is full.
-        """
+        """Write a checkpoint atomically; ``UserError`` if the folder cannot be written or the disk is full."""
         if "://" in str(path):  # a store without renaming
             super().save_checkpoint(checkpoint, path, storage_options)
             return
@@ -138,10 +134,6 @@ def last_checkpoint(trainer: pl.Trainer) -> Path | None:
 def check_parameters(found: Mapping[str, Any], module: pl.LightningModule) -> None:
     """Refuse checkpoint parameters that do not fit a module.
 
-    Args:
-        found: parameters of the checkpoint, by name.
-        module: module with its layers.
-
     Raises:
         UserError: for the first missing, unknown or non-finite parameter, or another shape.
     """
@@ -157,10 +149,6 @@ def check_parameters(found: Mapping[str, Any], module: pl.LightningModule) -> No
 
 def check_restored(module: pl.LightningModule, step: int) -> None:
     """Refuse inconsistent state that Lightning and torch accepted.
-
-    Args:
-        module: module with a starting trainer.
-        step: step of the checkpoint.
 
     Raises:
         UserError: for another step, an optimiser without state, or state whose shapes differ from the parameters'.
@@ -212,11 +200,7 @@ class Random(NamedTuple):
 
     @classmethod
     def read(cls, checkpoint: Mapping[str, Any]) -> "Random":
-        """Read from a checkpoint.
-
-        Raises:
-            UserError: for missing or damaged states.
-        """
+        """Read from a checkpoint; ``UserError`` for missing or damaged states."""
         try:
             states = cls(**checkpoint[_RANDOM])
             torch.Generator().set_state(states.cpu)
@@ -228,15 +212,7 @@ class Random(NamedTuple):
 
 
 def check_signature(expected: Mapping[str, Any], checkpoint: Mapping[str, Any]) -> None:
-    """Refuse a checkpoint with another signature.
-
-    Args:
-        expected: settings that must match.
-        checkpoint: content of the checkpoint.
-
-    Raises:
-        UserError: with the first key that differs.
-    """
+    """Refuse a checkpoint with another signature; ``UserError`` with the first key that differs."""
     signature = checkpoint.get(SIGNATURE, {})
     for key in expected | signature:
         value, setting = signature.get(key), expected.get(key)

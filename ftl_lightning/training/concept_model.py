@@ -102,7 +102,6 @@ class ConceptModel(Shown, nn.Module, ABC):
         Args:
             compositions: ``(K, ...)`` each; K may differ.
             count: samples for each composition.
-            sampling: sampler, steps and temperature.
             generators: a noise generator for each composition, so that samples do not depend on the rest of the batch.
             observed: features ``(composition * count, *shape)`` by name, in the domain's units; ``None`` for none.
 
@@ -126,8 +125,6 @@ class ConceptModel(Shown, nn.Module, ABC):
         Args:
             demonstrations: demonstrations; their concept texts name the concepts.
             settings: settings of the inversion; ignored without gradient descent.
-            steps: maximum number of gradient steps.
-            tell: called with the mean loss after each step.
             watch: called after each step of the first inversion, see :data:`~ftl_lightning.igm.inversion.Watch`.
             start: parameters of the first inversion, which are changed; ``None`` to create them.
 
@@ -150,11 +147,7 @@ class ConceptModel(Shown, nn.Module, ABC):
         raise NotImplementedError
 
     def check_settings(self, settings: InversionSettings) -> None:
-        """Refuse settings that the model does not support.
-
-        Raises:
-            UserError: with the key.
-        """
+        """Refuse settings that the model does not support; ``UserError`` with the key."""
         name, adapts = self.method.name, bool(self.adaptable())
         require(self.invertible, "model.pretrained", "a model that concepts are learned through", f"one of {name}")
         off_span, knots = settings.embeddings.off_span, settings.embeddings.knots
@@ -171,9 +164,7 @@ class ConceptModel(Shown, nn.Module, ABC):
 
         Args:
             demonstrations: demonstrations, including the concept's.
-            name: name of the concept.
             weights: ``'fixed'`` or ``'learned'``.
-            loss: final loss.
             pretrained: the model's hash, if known (hashing takes as long as several steps).
         """
         selected, space = demonstrations.select(name), (self.config.domain, self.config.encoder, pretrained or self.hash)
@@ -189,7 +180,6 @@ class ConceptModel(Shown, nn.Module, ABC):
         """Training windows ``(row, window, state)`` and their observed features, on the model's device.
 
         Args:
-            demonstrations: demonstrations.
             rows: row of the demonstration of each window ``(row,)``.
             share: relative start of each window ``(row,)``, 0 to 1.
             draw: generator of the perturbation, if the model is configured with one.
@@ -250,11 +240,7 @@ class ConceptModel(Shown, nn.Module, ABC):
         return self.empty.device
 
     def concept(self, text: str) -> Tensor:
-        """The embedding ``(n,)`` of a training concept.
-
-        Raises:
-            UserError: for an unknown text, with the nearest training concepts.
-        """
+        """The embedding ``(n,)`` of a training concept; ``UserError`` for an unknown text, with the nearest training concepts."""
         known = self.config.training_concepts
         if text not in known:
             near = difflib.get_close_matches(str(text), known, n=NEAREST, cutoff=0)
@@ -274,11 +260,7 @@ class ConceptModel(Shown, nn.Module, ABC):
         return {}
 
     def check_adapter(self, adapter: LowRank) -> None:
-        """Refuse an adapter that does not fit.
-
-        Raises:
-            UserError: naming the weight; always for a method without adapters.
-        """
+        """Refuse an adapter that does not fit; ``UserError`` naming the weight; always for a method without adapters."""
         raise UserError(f"key 'adapter': expected none for a model of {self.method.name}, found one")
 
     def perturbed(self, states: Tensor, observed: Observed, draw: torch.Generator) -> tuple[Tensor, Observed]:

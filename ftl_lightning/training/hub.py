@@ -27,11 +27,7 @@ def is_repository(name: str) -> bool:
 
 
 def check_repository(repository: object) -> str:
-    """Refuse an invalid name of a repository.
-
-    Raises:
-        UserError: with an example.
-    """
+    """Refuse an invalid name of a repository; ``UserError`` with an example."""
     if not isinstance(repository, str) or not _REPOSITORY.fullmatch(repository):
         raise UserError(f"repository: expected a name on the Hub, such as 'owner/name', found {shown(repository)}")
     return repository
@@ -41,11 +37,6 @@ def download(
     repository: str, files: Sequence[str] = MODEL_FILES, expected: str = "a folder, a model that ships or one on the Hub"
 ) -> Path:
     """Download the model or concept ``owner/name``, or take it from the cache, and return its folder.
-
-    Args:
-        repository: name of the repository.
-        files: patterns of the files to download.
-        expected: expected kinds of names, for messages.
 
     Raises:
         UserError: if the download fails.
@@ -63,7 +54,6 @@ def upload(write: Callable[[Path], object], repository: str, private: bool = Fal
 
     Args:
         write: writes the files into a folder; not called for an invalid name.
-        repository: the name.
         private: whether a new repository is private.
 
     Returns:

@@ -21,17 +21,7 @@ from ftl_lightning.training.model_folder import load_model
 
 @dataclass(frozen=True)
 class _Share:
-    """Work of one process.
-
-    Attributes:
-        folder: folder of the demonstrations and learned concepts.
-        model: folder or name of the pretrained model.
-        concepts: file numbers and texts of concepts.
-        settings: settings of the inversion.
-        steps: gradient steps.
-        device: device to learn on.
-        vouched: modules that the user trusts.
-    """
+    """Work of one process."""
 
     folder: str
     model: str
@@ -53,8 +43,6 @@ def learned_in_processes(
         model: folder or name of the pretrained model.
         device: device to learn on; with several GPUs, processes take them in turn.
         demonstrations: demonstrations; their concept texts name the concepts.
-        settings: settings of the inversion.
-        steps: gradient steps.
         processes: maximum number of processes; at most one for each concept.
 
     Raises:

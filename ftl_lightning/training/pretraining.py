@@ -131,7 +131,6 @@ class Pretraining(pl.LightningModule, ABC, Generic[M]):
         Args:
             prepared: configuration and text embeddings; a method adds options of its network by
                 :meth:`~ftl_lightning.training.model_config.Prepared.configured`.
-            data: training data.
         """
 
     @abstractmethod
@@ -355,11 +354,7 @@ class Pretraining(pl.LightningModule, ABC, Generic[M]):
 
 
 def check_dropout(shares: Mapping[str, float], features: Mapping[str, Feature]) -> dict[str, float]:
-    """Check and return the probabilities.
-
-    Raises:
-        UserError: for a name that is not an observed vector.
-    """
+    """Check and return the probabilities; ``UserError`` for a name that is not an observed vector."""
     vectors = [name for name, feature in features.items() if feature.kind == "vector"]
     for name in shares:
         if name not in vectors:
@@ -369,11 +364,7 @@ def check_dropout(shares: Mapping[str, float], features: Mapping[str, Feature]) 
 
 
 def check_shown(concepts: Sequence[str], shown: Sequence[str]) -> None:
-    """Refuse training concepts without demonstrations, for in-context methods.
-
-    Raises:
-        UserError: with the first such concept.
-    """
+    """Refuse training concepts without demonstrations, for in-context methods; ``UserError`` with the first such concept."""
     if absent := [text for text in concepts if text not in set(shown)]:
         raise UserError(
             f"data: expected a demonstration of each of {len(concepts)} training concepts, found none of {len(absent)}, such as "

@@ -116,11 +116,8 @@ def inspected(model: ConceptModel, domain: Domain, demonstrations: Demonstration
     """Inspect samples of a learned concept.
 
     Args:
-        model: generative model.
         domain: domain whose first success metric judges samples, if it can read the concept's name.
         demonstrations: two or more demonstrations of the concept.
-        concept: learned concept.
-        seed: seed of the samples.
     """
     name = concept.origin.name
     samples, starts = generated(model, demonstrations, {name: concept}, seed)

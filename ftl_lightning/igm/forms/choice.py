@@ -114,13 +114,7 @@ def _adapted(
 
 @dataclass(frozen=True)
 class _Shares:
-    """Losses of one set of embeddings, relative to the unconditional loss on the same demonstrations.
-
-    Attributes:
-        own: training loss.
-        left_out: mean leave-one-out loss; ``None`` for fewer than three demonstrations.
-        in_span: mean leave-one-out loss in the span of the training concepts; ``None`` also for models without text concepts.
-    """
+    """Losses of one set of embeddings, relative to the unconditional loss on the same demonstrations."""
 
     own: float
     left_out: float | None = None

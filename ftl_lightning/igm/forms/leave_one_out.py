@@ -40,14 +40,7 @@ COMPARED = 8
 
 @dataclass(frozen=True)
 class _Noised:
-    """Windows of demonstrations, and noise shared by all demonstrations and concepts.
-
-    Attributes:
-        model, kind: model and kind of the loss.
-        states, seen: windows ``(demo * sample, window, state)``, ordered by demonstration, and their observations.
-        draws: timesteps and noise.
-        demonstrations: number of demonstrations.
-    """
+    """Windows of demonstrations, and noise shared by all demonstrations and concepts."""
 
     model: Invertible
     kind: str
@@ -96,8 +89,6 @@ def relative_losses(
     Noise, timesteps and starts of windows are shared by all demonstrations and concepts.
 
     Args:
-        model: model of the loss.
-        demonstrations: demonstrations that fit the model.
         concepts: ``(concept, K, ...)``, on the model's device.
         settings: kind of loss, timesteps, and samples a step; each demonstration gets twice as many noised samples.
         tell: called with the number of concepts after each batch.
@@ -233,12 +224,7 @@ def learned_from(
     """Learn one set of embeddings for each subset, in one batch: ``(subset, K, ...)`` on the model's device.
 
     Args:
-        model: the frozen model.
-        demonstrations: demonstrations of one concept or several.
-        chosen: rows of each subset.
         settings: settings in the paper's form.
-        steps: maximum number of gradient steps.
-        tell: called with the mean loss after each step.
     """
     parts = [replace(demonstrations.rows(list(rows)), concepts=(f"{number}",) * len(rows)) for number, rows in enumerate(chosen)]
     sets = list(invert(model, concatenate(parts), settings, steps, tell).values())
@@ -264,11 +250,8 @@ def leave_one_out(
     """Learn the concept from subsets, in one batch, and measure each on the left-out demonstrations.
 
     Args:
-        model: the frozen model.
         demonstrations: two or more of one concept; the first :data:`MOST` are used.
         settings: settings of the inversion; modes, adapters and restarts are ignored.
-        steps: maximum number of gradient steps.
-        tell: called with the mean loss after each step.
     """
     count = min(len(demonstrations), MOST)
     used, chosen = demonstrations.rows(list(range(count))), subsets(count)

@@ -69,10 +69,6 @@ class Modes(Shown):
         """Draw modes or mixtures: embeddings ``(row, K, knots, n)``, weights ``(row, K)``, and the row of each sample ``(count,)``.
 
         A mixture is ``mean + stretch * sum_m share_m (mode_m - mean)`` with shares uniform on the simplex (Dirichlet(1)).
-
-        Args:
-            count: number of samples.
-            generator: generator of modes or shares.
         """
         if not self.mixed:
             chosen = torch.randint(len(self), (count,), generator=generator, device=generator.device)

@@ -110,11 +110,7 @@ class InContextModel(ConceptModel):
         return read.unflatten(0, (-1, tokens)).flatten(1).cpu()
 
     def present_vector(self, observed: Observed) -> Tensor:
-        """Normalised observation ``(batch, m)``, see :meth:`vector`.
-
-        Raises:
-            UserError: for a domain without observed features.
-        """
+        """Normalised observation ``(batch, m)``, see :meth:`vector`; ``UserError`` for a domain without observed features."""
         vector = self.vector(observed)
         if vector is None:
             raise UserError(
@@ -142,11 +138,7 @@ class InContextModel(ConceptModel):
         return ((normalised + 1) / 2 * self.config.bins).long().clamp(0, self.config.bins - 1)
 
     def read_concepts(self, demonstrations: Demonstrations) -> dict[str, Concept]:
-        """Encode demonstrations as concepts.
-
-        Raises:
-            UserError: for features observed only at the first time.
-        """
+        """Encode demonstrations as concepts; ``UserError`` for features observed only at the first time."""
         concepts = {}
         for name in dict.fromkeys(demonstrations.concepts):
             prompts = self.prompts(demonstrations.select(name))
