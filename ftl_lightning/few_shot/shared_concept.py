@@ -22,8 +22,7 @@ from ftl_lightning.evaluation.pictures import captioned, gif
 from ftl_lightning.few_shot.tuned import ModelSettings
 from ftl_lightning.igm.composition import Composition, space_of
 from ftl_lightning.igm.concept import Concept
-from ftl_lightning.igm.library import CONCEPT
-from ftl_lightning.igm.summary import summary
+from ftl_lightning.igm.library import CONCEPT, summary
 from ftl_lightning.services.errors import UserError, short
 from ftl_lightning.services.files import read_text
 from ftl_lightning.services.randomness import generator

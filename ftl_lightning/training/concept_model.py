@@ -12,12 +12,11 @@ from torch import Tensor, nn
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import READ, Feature, Observed, check_features, moved
 from ftl_lightning.igm.composition import Composition
-from ftl_lightning.igm.concept import Concept, Origin
+from ftl_lightning.igm.concept import EMPTY_CONCEPT, TRAINING_CONCEPT, Concept, Origin, Point
 from ftl_lightning.igm.forms.adapter import LowRank
 from ftl_lightning.igm.forms.choice import learn
 from ftl_lightning.igm.inversion import Inversion, Tell, Watch
 from ftl_lightning.igm.model import Draws
-from ftl_lightning.igm.point import EMPTY_CONCEPT, TRAINING_CONCEPT, Point
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.igm.settings import ADAPTED, AUTO, MIXED, MODES, ONE, PAPER, InversionSettings
 from ftl_lightning.networks.image_encoder import ImageEncoders

@@ -19,7 +19,7 @@ from ftl_lightning.data.normalization import Normalization
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.tasks import WITHOUT_WEIGHT, EvaluationTask
 from ftl_lightning.igm.composition import Composition
-from ftl_lightning.igm.point import Point
+from ftl_lightning.igm.concept import Point
 from ftl_lightning.networks.image_encoder import ImageEncoders
 from ftl_lightning.networks.text_encoder import EMPTY
 from ftl_lightning.services.errors import UserError

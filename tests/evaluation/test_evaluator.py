@@ -37,7 +37,7 @@ from ftl_lightning.evaluation.row import Row
 from ftl_lightning.evaluation.rows import configuration
 from ftl_lightning.evaluation.tensorboard import picture
 from ftl_lightning.igm.composition import Composition
-from ftl_lightning.igm.point import Point
+from ftl_lightning.igm.concept import Point
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.training.model_folder import read_model

@@ -51,11 +51,7 @@ class ParallelMLP(nn.Module):
 
 
 class CloningModel(AdditiveModel, TextConceptModel):
-    """Deterministic policy of the concept and, if observed, the state; composing adds concepts.
-
-    Args:
-        prepared: configuration and domain.
-    """
+    """Deterministic policy of the concept and, if observed, the state; composing adds concepts."""
 
     method = METHOD
     Config = CloningConfig

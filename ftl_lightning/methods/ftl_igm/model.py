@@ -68,11 +68,7 @@ def build_denoiser(config: DiffusionConfig) -> nn.Module:
 
 
 class GenerativeModel(DiffusionModel, TextConceptModel):
-    """Conditional diffusion model of plans.
-
-    Args:
-        prepared: configuration, domain and text embeddings.
-    """
+    """Conditional diffusion model of plans."""
 
     method = METHOD
     invertible = True

@@ -50,9 +50,6 @@ class InContextModel(ConceptModel):
     The encoder reads transitions, with a zero vector between demonstrations. The decoder reads the current observation (the paper's
     window of 1) and predicts probabilities of bins over [-1, 1] for each value of the next state.
 
-    Args:
-        prepared: configuration and domain.
-
     Raises:
         UserError: for a width that is not a multiple of the heads.
     """
