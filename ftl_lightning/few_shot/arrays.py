@@ -25,15 +25,12 @@ def demonstrations_of(
     observed: Mapping[str, ArrayLike] | ArrayLike | None,
     name: str,
 ) -> Demonstrations:
-    """Convert arrays to demonstrations of a single concept.
+    """Convert arrays to demonstrations of a single concept; ``UserError`` for arrays that do not fit the domain.
 
     Args:
         states: ``(demo, time, state)``, or a list of ``(time, state)`` of any lengths.
         observed: features by name, or the only feature: ``(demo, time, *shape)`` if observed at every time, ``(demo, *shape)`` if
             only at the first; for different lengths, a list as for the states.
-
-    Raises:
-        UserError: for arrays that do not fit the domain.
     """
     if isinstance(states, Demonstrations):
         check_of_domain("states", states, domain)

@@ -67,14 +67,11 @@ def write_folder(
 
 
 def read_folder(folder: Path, name: str, space: str) -> Concept:
-    """Read the concept of a shared folder.
+    """Read the concept of a shared folder; ``UserError`` without a concept, or for another model's concept, with that model.
 
     Args:
         folder: local or downloaded folder.
         space: concept space of the model, see :func:`~ftl_lightning.igm.composition.space_of`.
-
-    Raises:
-        UserError: without a concept, or for another model's concept, with that model.
     """
     concept = Concept.load(folder / CONCEPT)
     if (owner := space_of(concept.origin.domain, concept.origin.pretrained)) != space:
@@ -96,15 +93,12 @@ def _model_of(path: Path) -> str:
 
 
 def card(path: Path, known_as: str, shown: str, with_demonstrations: bool) -> str:
-    """Card with the Hub's metadata.
+    """Card with the Hub's metadata; ``UserError`` for a file that is not a concept.
 
     Args:
         known_as: public name of the model; empty without one.
         shown: file name of the film or picture; empty for none.
         with_demonstrations: whether the folder includes demonstrations.
-
-    Raises:
-        UserError: for a file that is not a concept.
     """
     content = summary(path)
     if content is None:

@@ -231,7 +231,7 @@ def _columns_of(compositions: Sequence[Composition]) -> int | None:
 
 
 def batched(compositions: Sequence[Composition], count: int, generators: Sequence[torch.Generator]) -> tuple[Composition, Tensor]:
-    """Collate compositions into a batch.
+    """Collate compositions into a batch; ``UserError`` for two different numbers of knots, neither of which is 1.
 
     Args:
         compositions: ``(K, ...)`` each; K may differ.
@@ -240,9 +240,6 @@ def batched(compositions: Sequence[Composition], count: int, generators: Sequenc
 
     Returns:
         Composition ``(row, max K, ...)``, padded with zero weights, and the row of each sample ``(composition * count,)``.
-
-    Raises:
-        UserError: for two different numbers of knots, neither of which is 1.
     """
     compositions = [composition.uncomposed for composition in compositions]
     knots, state = _common([composition.knots for composition in compositions]), _columns_of(compositions)

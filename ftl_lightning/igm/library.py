@@ -210,7 +210,7 @@ def _name_in(path: Path) -> str:
 
 
 def library(model: str, training: Sequence[str], own: Path | None = None, folders: Iterable[str | Path] = ()) -> Library:
-    """Library of a model's concepts.
+    """Library of a model's concepts; ``UserError`` for an entry of ``folders`` that is not a folder.
 
     Args:
         model: hash of the model.
@@ -218,9 +218,6 @@ def library(model: str, training: Sequence[str], own: Path | None = None, folder
         own: the model's folder, with shipped concepts ``*.safetensors``; ``None`` without a folder.
         folders: folders of saved concepts ``*.safetensors``, directly or in subfolders; :func:`concepts_folder` is always
             searched.
-
-    Raises:
-        UserError: for an entry of ``folders`` that is not a folder.
     """
     places = [Path(folder) for folder in folders]
     for place in places:

@@ -146,14 +146,11 @@ def check_with(
     found: tuple[Finding, ...] = (),
     progress: bool = False,
 ) -> Check:
-    """Check demonstrations of one concept with a model.
+    """Check demonstrations of one concept with a model; ``UserError`` for a model without inversion.
 
     Args:
         demonstrations: demonstrations of one concept that fit the model.
         steps: maximum number of gradient steps on subsets; 0 to learn nothing.
-
-    Raises:
-        UserError: for a model without inversion.
     """
     model.check_settings(settings)
     name = demonstrations.concepts[0]

@@ -50,7 +50,7 @@ def download(
 
 
 def upload(write: Callable[[Path], object], repository: str, private: bool = False) -> str:
-    """Upload a folder as ``owner/name``; needs a login.
+    """Upload a folder as ``owner/name``; needs a login; ``UserError`` for an invalid name, or if the upload fails.
 
     Args:
         write: writes the files into a folder; not called for an invalid name.
@@ -58,9 +58,6 @@ def upload(write: Callable[[Path], object], repository: str, private: bool = Fal
 
     Returns:
         The address.
-
-    Raises:
-        UserError: for an invalid name, or if the upload fails.
     """
     check_repository(repository)
     with tempfile.TemporaryDirectory() as folder:

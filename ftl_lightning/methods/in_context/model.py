@@ -84,14 +84,11 @@ class InContextModel(ConceptModel):
         return self.config.window
 
     def prompts(self, demonstrations: Demonstrations, perturbed: bool = False) -> Tensor:
-        """Encode demonstrations as prompts ``(demo, n)``.
+        """Encode demonstrations as prompts ``(demo, n)``; ``UserError`` if features are observed only at the first time.
 
         Args:
             demonstrations: demonstrations with features observed at every time.
             perturbed: apply the view's perturbation, if configured.
-
-        Raises:
-            UserError: if features are observed only at the first time.
         """
         if not demonstrations.per_step or not set(self.domain.observed) <= set(demonstrations.per_step):
             raise UserError("key 'per_step': expected every feature to be observed at each time, found others")
