@@ -52,8 +52,7 @@ class Known:
     @property
     def clear(self) -> bool:
         """Whether it explains nearly all demonstrations, and their mean loss."""
-        mean = sum(self.losses) / len(self.losses)
-        return self.count >= MOST_OF * len(self.losses) and mean <= MARGIN
+        return self.count >= MOST_OF * len(self.losses) and sum(self.losses) / len(self.losses) <= MARGIN
 
     def __str__(self) -> str:
         mean = sum(self.losses) / len(self.losses)
@@ -168,10 +167,9 @@ def check_with(
 
 
 def longer_than_plans(demonstrations: Demonstrations, model: ConceptModel) -> str:
-    """Note about the use of demonstrations that are longer than the model's plans.
+    """Note about the use of demonstrations that are longer than the model's plans; empty without any.
 
-    Empty if demonstrations are not longer, or in closed-loop domains with observations at every time, where a plan may start at
-    any time.
+    A plan may start at any time in closed-loop domains with observations at every time, which need no note.
     """
     window, plans = model.window, model.domain.plans
     longest, shortest = int(demonstrations.lengths.max()), int(demonstrations.lengths.min())

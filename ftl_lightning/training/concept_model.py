@@ -122,13 +122,7 @@ class ConceptModel(Shown, nn.Module, ABC):
         A model that is not :attr:`invertible` reads its concepts from the demonstrations, see :meth:`read_concepts`.
 
         Args:
-            demonstrations: demonstrations; their concept texts name the concepts.
-            settings: settings of the inversion; ignored without gradient descent.
-            watch: called after each step of the first inversion, see :data:`~ftl_lightning.igm.inversion.Watch`.
-            start: parameters of the first inversion, which are changed; ``None`` to create them.
-
-        Returns:
-            Concepts by name.
+            demonstrations, settings, steps, tell, watch, start: see :func:`~ftl_lightning.igm.forms.choice.learn`.
 
         Raises:
             UserError: for settings that the model does not support, or a loss that is not finite.
@@ -189,7 +183,7 @@ class ConceptModel(Shown, nn.Module, ABC):
         return self.perturbed(states.to(self.device), moved(observed, self.device), draw)
 
     def losses(self, states: Tensor, observed: Observed, composition: Composition, draws: Draws | None, loss: str) -> Tensor:
-        """Losses of behaviour under concepts, for inversion by gradient descent.
+        """Losses ``(run, sample)`` of behaviour under concepts, for inversion by gradient descent.
 
         Args:
             states: ``(run * sample, window, state)`` in the domain's units.
@@ -197,9 +191,6 @@ class ConceptModel(Shown, nn.Module, ABC):
             composition: ``(run, K, ...)``.
             draws: result of :meth:`draws`.
             loss: target of a diffusion model's squared error.
-
-        Returns:
-            ``(run, sample)``.
         """
         raise NotImplementedError
 
@@ -278,14 +269,11 @@ class ConceptModel(Shown, nn.Module, ABC):
         return states if self.view is None else self.view.decode(states, observed)
 
     def vector(self, observed: Observed) -> Tensor | None:
-        """Observation vector ``(batch, m)`` of the network: normalised vectors, then image encodings.
+        """Observation vector ``(batch, m)`` of the network: normalised vectors, then image encodings; ``None`` without any.
 
         Args:
             observed: features by name, in the domain's units; :data:`~ftl_lightning.data.features.READ`, the result of
                 :meth:`of_images`, may replace the images.
-
-        Returns:
-            ``None`` if nothing is observed.
 
         Raises:
             UserError: for a missing feature or another shape.

@@ -50,14 +50,11 @@ def download(
 
 
 def upload(write: Callable[[Path], object], repository: str, private: bool = False) -> str:
-    """Upload a folder as ``owner/name``; needs a login; ``UserError`` for an invalid name, or if the upload fails.
+    """Upload a folder as ``owner/name`` and return its address; ``UserError`` for an invalid name or a failed upload.
 
     Args:
         write: writes the files into a folder; not called for an invalid name.
         private: whether a new repository is private.
-
-    Returns:
-        The address.
     """
     check_repository(repository)
     with tempfile.TemporaryDirectory() as folder:

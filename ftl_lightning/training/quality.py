@@ -25,14 +25,7 @@ SHOWN = 16
 
 
 def right_plans(measured: Mapping[str, Tensor]) -> tuple[str, Tensor] | None:
-    """Which plans are right: the first boolean metric per plan.
-
-    Args:
-        measured: values of a domain's metrics by name, see :meth:`~ftl_lightning.domains.domain.Domain.measure`.
-
-    Returns:
-        Name and values ``(sample,)`` of the metric; ``None`` without such a metric.
-    """
+    """Name and values ``(sample,)`` of the first boolean metric per plan, of metrics by name; ``None`` without such a metric."""
     return next(((name, values) for name, values in measured.items() if values.dtype == torch.bool and values.dim()), None)
 
 

@@ -28,8 +28,6 @@ FAR = 10.0
 """Minimum ratio of the training loss to the loss of generated behaviour for a task far from pretraining."""
 FALLING = 0.05
 """Minimum relative fall of the left-out loss for one more demonstration, for more to be likely to help."""
-
-
 TOGETHER = 4096
 """Maximum number of noised demonstrations in a batch."""
 GENERATED = Sampling("dpm_solver", 10)
@@ -84,7 +82,7 @@ def relative_losses(
     settings: InversionSettings,
     tell: Callable[[int], None] = lambda count: None,
 ) -> Tensor:
-    """Losses relative to the unconditional loss; below 1 if a concept explains a demonstration.
+    """Losses ``(concept, demo)`` on the CPU, relative to the unconditional loss; below 1 if a concept explains a demonstration.
 
     Noise, timesteps and starts of windows are shared by all demonstrations and concepts.
 
@@ -92,9 +90,6 @@ def relative_losses(
         concepts: ``(concept, K, ...)``, on the model's device.
         settings: kind of loss, timesteps, and samples a step; each demonstration gets twice as many noised samples.
         tell: called with the number of concepts after each batch.
-
-    Returns:
-        ``(concept, demo)`` on the CPU.
     """
     noised = _Noised.of(model, demonstrations, settings, _samples(settings))
     empty = noised.empty(concepts)
@@ -111,13 +106,7 @@ def generated_loss(model: Invertible, demonstrations: Demonstrations, settings: 
     """Loss of generated behaviour, in the units of :func:`relative_losses`: a lower bound of losses.
 
     Behaviour of training concepts is generated from the windows' initial states. A concept learned as well as in pretraining has
-    about this loss.
-
-    Args:
-        model, demonstrations, settings: as in :func:`relative_losses`.
-
-    Returns:
-        Median over at most :data:`COMPARED` training concepts.
+    about this loss. The median over at most :data:`COMPARED` training concepts is returned.
     """
     embeddings = model.training_embeddings[:, None, None]
     chosen = torch.linspace(0, len(embeddings) - 1, min(COMPARED, len(embeddings))).round().long()

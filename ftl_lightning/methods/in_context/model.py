@@ -105,8 +105,7 @@ class InContextModel(ConceptModel):
 
     def present_vector(self, observed: Observed) -> Tensor:
         """Normalised observation ``(batch, m)``, see :meth:`vector`; ``UserError`` for a domain without observed features."""
-        vector = self.vector(observed)
-        if vector is None:
+        if (vector := self.vector(observed)) is None:
             raise UserError(
                 f"domain: expected one with observed features, found {self.domain.name}: there is no present to go on from"
             )
