@@ -77,7 +77,8 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     try:
         return _read(Path(path))
     except UserError as error:
-        checkpoints = sorted(_beside(Path(path)), key=lambda checkpoint: checkpoint.stat().st_mtime, reverse=True)
+        others = [checkpoint for checkpoint in visible(Path(path).parent, "*.ckpt") if checkpoint.name != Path(path).name]
+        checkpoints = sorted(others, key=lambda checkpoint: checkpoint.stat().st_mtime, reverse=True)
         if whole := next((checkpoint for checkpoint in checkpoints if _is_whole(checkpoint)), None):
             raise UserError(f"{error}; go on from the newest whole one: --ckpt_path {whole}") from error.__cause__
         raise
@@ -117,11 +118,6 @@ def _is_whole(path: Path) -> bool:
     except UserError:
         return False
     return True
-
-
-def _beside(path: Path) -> list[Path]:
-    """Other checkpoints of the folder."""
-    return [checkpoint for checkpoint in visible(path.parent, "*.ckpt") if checkpoint.name != path.name]
 
 
 def last_checkpoint(trainer: pl.Trainer) -> Path | None:

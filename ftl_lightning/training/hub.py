@@ -26,13 +26,6 @@ def is_repository(name: str) -> bool:
     return bool(slash) and "/" not in rest and owner not in FOLDERS and not owner.startswith((".", "~"))
 
 
-def check_repository(repository: object) -> str:
-    """Refuse an invalid name of a repository; ``UserError`` with an example."""
-    if not isinstance(repository, str) or not _REPOSITORY.fullmatch(repository):
-        raise UserError(f"repository: expected a name on the Hub, such as 'owner/name', found {shown(repository)}")
-    return repository
-
-
 def download(
     repository: str, files: Sequence[str] = MODEL_FILES, expected: str = "a folder, a model that ships or one on the Hub"
 ) -> Path:
@@ -56,7 +49,8 @@ def upload(write: Callable[[Path], object], repository: str, private: bool = Fal
         write: writes the files into a folder; not called for an invalid name.
         private: whether a new repository is private.
     """
-    check_repository(repository)
+    if not isinstance(repository, str) or not _REPOSITORY.fullmatch(repository):
+        raise UserError(f"repository: expected a name on the Hub, such as 'owner/name', found {shown(repository)}")
     with tempfile.TemporaryDirectory() as folder:
         write(Path(folder))
         from huggingface_hub import HfApi
