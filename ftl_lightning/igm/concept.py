@@ -327,7 +327,7 @@ def file_name(concept: str) -> str:
 
 
 def _expect_shapes(tensors: Mapping[str, Tensor]) -> None:
-    """Check that the tensors of a concept are float32 with consistent shapes."""
+    """Check that tensors are float32: ``embeddings (K, knots, n)``, ``weights (K,)``, and any of modes and composing."""
     shape = tuple(tensors["embeddings"].shape)
     if len(shape) != 3 or not all(shape):
         raise UserError(f"key 'embeddings': expected shape (K, knots, n), found {shape}")

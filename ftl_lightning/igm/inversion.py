@@ -46,6 +46,7 @@ def invert(
 
     Args:
         demonstrations: demonstrations; their concept texts name the concepts.
+        steps: maximum number of gradient steps.
         tell, watch: callbacks after each step; reading the concepts so far changes nothing.
         start: initial parameters, which are changed; ``None`` to create them.
 

@@ -21,7 +21,7 @@ from ftl_lightning.training.model_folder import load_model
 
 @dataclass(frozen=True)
 class _Share:
-    """Work of one process."""
+    """Work of one process: file numbers and texts of concepts, and the folder of demonstrations and learned concepts."""
 
     folder: str
     model: str

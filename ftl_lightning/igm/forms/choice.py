@@ -107,7 +107,7 @@ def _adapted(
 
 @dataclass(frozen=True)
 class _Shares:
-    """Losses of one set of embeddings, relative to the unconditional loss on the same demonstrations."""
+    """Relative training, mean leave-one-out (``None`` for under three) and in-span (``None`` without texts) losses of a set."""
 
     own: float
     left_out: float | None = None

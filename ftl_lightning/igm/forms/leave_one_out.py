@@ -38,7 +38,7 @@ COMPARED = 8
 
 @dataclass(frozen=True)
 class _Noised:
-    """Windows of demonstrations, and noise shared by all demonstrations and concepts."""
+    """Windows ``(demo * sample, window, state)`` by demonstration, what is ``seen`` there, and noise shared by all concepts."""
 
     model: Invertible
     kind: str
