@@ -16,7 +16,7 @@ from ftl_lightning.domains.execution import Rollout
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.evaluation.closed_loop import PlanFollower, planner, roll_out, sampled_plans
 from ftl_lightning.igm.composition import Composition
-from ftl_lightning.igm.point import Point
+from ftl_lightning.igm.concept import Point
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.services.errors import UserError, require, shown
 from ftl_lightning.services.randomness import EVALUATION_SEED, generator, task_key

@@ -24,8 +24,8 @@ from ftl_lightning.evaluation.generation import LOST, WON, TaskResult, share
 from ftl_lightning.evaluation.pictures import captioned, gif, outcome_text
 from ftl_lightning.evaluation.results import METHOD, Row
 from ftl_lightning.evaluation.summary import plain, summary_table
+from ftl_lightning.igm.concept import Part, Point
 from ftl_lightning.igm.forms.quality import first_windows
-from ftl_lightning.igm.point import Part, Point
 from ftl_lightning.services.text import line
 from ftl_lightning.training.board import FILMS, PICTURES, RESULTS, ROLLOUTS
 

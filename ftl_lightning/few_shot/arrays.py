@@ -25,17 +25,12 @@ def demonstrations_of(
     observed: Mapping[str, ArrayLike] | ArrayLike | None,
     name: str,
 ) -> Demonstrations:
-    """Convert arrays to demonstrations of a single concept.
+    """Convert arrays to demonstrations of a single concept; ``UserError`` for arrays that do not fit the domain.
 
     Args:
-        domain: domain of the behaviour.
         states: ``(demo, time, state)``, or a list of ``(time, state)`` of any lengths.
         observed: features by name, or the only feature: ``(demo, time, *shape)`` if observed at every time, ``(demo, *shape)`` if
             only at the first; for different lengths, a list as for the states.
-        name: name of the concept.
-
-    Raises:
-        UserError: for arrays that do not fit the domain.
     """
     if isinstance(states, Demonstrations):
         check_of_domain("states", states, domain)
@@ -67,11 +62,7 @@ def demonstrations_of(
 
 
 def of_one_concept(own: Demonstrations) -> Demonstrations:
-    """Return demonstrations of a single concept unchanged.
-
-    Raises:
-        UserError: naming the concepts, if there are several.
-    """
+    """Return demonstrations of a single concept unchanged; ``UserError`` naming the concepts, if there are several."""
     if len(concepts := set(own.concepts)) > 1:
         names = short(", ".join(sorted(concepts)), 150)
         raise UserError(f"states: expected demonstrations of one concept, found those of {names}; choose with select(name)")
@@ -92,11 +83,7 @@ def mended_states(
 
 
 def check_of_domain(key: str, plans: object, domain: Domain) -> None:
-    """Refuse behaviour of another domain.
-
-    Raises:
-        UserError: naming both domains.
-    """
+    """Refuse behaviour of another domain; ``UserError`` naming both domains."""
     if not isinstance(plans, Demonstrations):
         raise UserError(f"{key}: expected plans, such as model.sample returns, found {shown(plans)}")
     # Data of a user may have any domain name.
@@ -138,11 +125,7 @@ def _starts(domain: Domain, given: Any) -> InitialStates:
 
 
 def scenes_of(given: ArrayLike) -> Tensor:
-    """Convert scenes of initial states to ``(episode, scene)``.
-
-    Raises:
-        UserError: for anything else.
-    """
+    """Convert scenes of initial states to ``(episode, scene)``; ``UserError`` for anything else."""
     scenes = tensor_of("scenes", given)
     if scenes.dim() != 2 or not len(scenes) or not scenes.isfinite().all():
         raise UserError(
@@ -172,11 +155,7 @@ def tensor_of(key: str, values: Any) -> Tensor:
 
 
 def _padded(key: str, values: Any) -> tuple[Tensor, Tensor]:
-    """Stack arrays, padded with their last time, and return their lengths.
-
-    Raises:
-        UserError: for anything else.
-    """
+    """Stack arrays, padded with their last time, and return their lengths."""
     several = isinstance(values, np.ndarray) and values.dtype == object and values.ndim > 0
     if several or not hasattr(values, "__array__"):  # a tensor has it too
         if isinstance(values, str | bytes | Mapping) or not isinstance(values, Iterable):
@@ -200,11 +179,7 @@ def _padded(key: str, values: Any) -> tuple[Tensor, Tensor]:
 
 
 def _by_name(observed: Any, features: Mapping[str, Feature]) -> dict[str, Any]:
-    """Observed features by name; a single value is that of the only feature.
-
-    Raises:
-        UserError: for an unknown name, or a value without a name if there are several features.
-    """
+    """Observed features by name; a single value is that of the only feature."""
     if observed is None:
         return {}
     if isinstance(observed, Mapping):

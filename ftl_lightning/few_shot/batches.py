@@ -21,12 +21,7 @@ from ftl_lightning.training.concept_model import ConceptModel
 
 @dataclass(frozen=True)
 class _Part(Sampling):
-    """Sampling of some of the plans.
-
-    Attributes:
-        own: draws their noise; ``None`` for the model's noise.
-        advance: called after each step.
-    """
+    """Sampling of some of the plans."""
 
     own: Noise | None = None
     advance: Callable[[], None] = field(default=lambda: None)
@@ -56,14 +51,8 @@ def sampled(
     without a sampler need one pass of a small network and ignore it.
 
     Args:
-        model: the model.
-        concept: concept of all plans.
-        count: number of plans.
-        sampling: sampler, steps and temperature.
-        seed: seed of the noise.
         observed: features ``(count, *shape)`` by name, on the model's device.
         batch_size: maximum number of plans in a batch; ``None`` for all.
-        progress: show a bar.
     """
     size = count if batch_size is None or model.max_steps is None else min(batch_size, count)
     steps = 1 if model.max_steps is None else sampling.steps

@@ -13,7 +13,7 @@ from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.igm.explanation import Explanation, explain
 from ftl_lightning.igm.library import kept_file
-from ftl_lightning.services.errors import UserError, short, shown
+from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.validation import check_whole
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.hub import upload
@@ -144,34 +144,3 @@ class LearnedConcept(Composition):
             UserError: for an invalid name or a failed upload.
         """
         return upload(lambda folder: self.save_pretrained(folder, demonstrations), repository, private)
-
-
-def concept_of(model: ConceptModel, space: str, call: str, concept: object) -> Composition:
-    """Check a concept and move it to the model's device.
-
-    Args:
-        model: the model.
-        space: concept space of the model, see :func:`~ftl_lightning.igm.composition.space_of`.
-        call: name of the called method, such as ``'sample'``.
-        concept: argument of the method.
-
-    Raises:
-        UserError: for another model's concept, or another object.
-    """
-    if not isinstance(concept, Composition):
-        text = short(model.config.training_concepts[0], 40)
-        raise UserError(
-            f"{call}: expected a concept, such as model[{text!r}], model.compose(text), model.load(path) or what model.learn "
-            f"returns, found {shown(concept)}"
-        )
-    if concept.space not in ("", space):
-        raise UserError(
-            f"{call}: expected a concept of this model, {space}, found one of {concept.space}; learn it with this model"
-        )
-    n = model.config.concept_dim
-    if concept.embeddings.dim() != 3 or concept.embeddings.shape[2] != n:
-        raise UserError(
-            f"{call}: expected a concept of this model, {space}, with embeddings (K, knots, {n}), "
-            f"found {tuple(concept.embeddings.shape)}"
-        )
-    return concept if concept.weights.device == model.device else concept.to(model.device)

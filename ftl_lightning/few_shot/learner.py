@@ -29,7 +29,7 @@ from ftl_lightning.few_shot.arrays import (
 )
 from ftl_lightning.few_shot.batches import plans_of, sampled
 from ftl_lightning.few_shot.composition_text import Part, parse_composition
-from ftl_lightning.few_shot.learned_concept import LearnedConcept, Learning, concept_of
+from ftl_lightning.few_shot.learned_concept import LearnedConcept, Learning
 from ftl_lightning.few_shot.shared_concept import read_folder
 from ftl_lightning.few_shot.tuned import ModelSettings, settings_of
 from ftl_lightning.igm.composition import Composition, space_of
@@ -238,8 +238,24 @@ class FewShot(Shown):
         )
 
     def _own(self, call: str, concept: object) -> Composition:
-        """Check a concept and move it to the model's device."""
-        return concept_of(self.model, self._space, call, concept)
+        """Check the argument of a method and move it to the model's device; ``UserError`` unless it is a concept of the model."""
+        if not isinstance(concept, Composition):
+            text = short(self.model.config.training_concepts[0], 40)
+            raise UserError(
+                f"{call}: expected a concept, such as model[{text!r}], model.compose(text), model.load(path) or what model.learn "
+                f"returns, found {shown(concept)}"
+            )
+        if concept.space not in ("", self._space):
+            raise UserError(
+                f"{call}: expected a concept of this model, {self._space}, found one of {concept.space}; learn it with this model"
+            )
+        n = self.model.config.concept_dim
+        if concept.embeddings.dim() != 3 or concept.embeddings.shape[2] != n:
+            raise UserError(
+                f"{call}: expected a concept of this model, {self._space}, with embeddings (K, knots, {n}), "
+                f"found {tuple(concept.embeddings.shape)}"
+            )
+        return concept if concept.weights.device == self.device else concept.to(self.device)
 
     def demonstrations(
         self,

@@ -22,8 +22,7 @@ from ftl_lightning.evaluation.pictures import captioned, gif
 from ftl_lightning.few_shot.tuned import ModelSettings
 from ftl_lightning.igm.composition import Composition, space_of
 from ftl_lightning.igm.concept import Concept
-from ftl_lightning.igm.library import CONCEPT
-from ftl_lightning.igm.summary import summary
+from ftl_lightning.igm.library import CONCEPT, summary
 from ftl_lightning.services.errors import UserError, short
 from ftl_lightning.services.files import read_text
 from ftl_lightning.services.randomness import generator
@@ -52,10 +51,6 @@ def write_folder(
     """Write the folder of a concept; an existing card is kept.
 
     Args:
-        folder: folder to write.
-        model: the concept's model.
-        concept: learned concept.
-        tuned: settings of sampling.
         known_as: public name of the model; empty without one.
         demonstrations: demonstrations to include; ``None`` for none.
     """
@@ -72,15 +67,11 @@ def write_folder(
 
 
 def read_folder(folder: Path, name: str, space: str) -> Concept:
-    """Read the concept of a shared folder.
+    """Read the concept of a shared folder; ``UserError`` without a concept, or for another model's concept, with that model.
 
     Args:
         folder: local or downloaded folder.
-        name: name given by the user, for messages.
         space: concept space of the model, see :func:`~ftl_lightning.igm.composition.space_of`.
-
-    Raises:
-        UserError: without a concept, or for another model's concept, with that model.
     """
     concept = Concept.load(folder / CONCEPT)
     if (owner := space_of(concept.origin.domain, concept.origin.pretrained)) != space:
@@ -102,16 +93,12 @@ def _model_of(path: Path) -> str:
 
 
 def card(path: Path, known_as: str, shown: str, with_demonstrations: bool) -> str:
-    """Card with the Hub's metadata.
+    """Card with the Hub's metadata; ``UserError`` for a file that is not a concept.
 
     Args:
-        path: the concept's file.
         known_as: public name of the model; empty without one.
         shown: file name of the film or picture; empty for none.
         with_demonstrations: whether the folder includes demonstrations.
-
-    Raises:
-        UserError: for a file that is not a concept.
     """
     content = summary(path)
     if content is None:

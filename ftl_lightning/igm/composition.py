@@ -27,12 +27,7 @@ class Adapter(Protocol):
 
 
 def space_of(domain: str, model_hash: str) -> str:
-    """Description of a model's concept space.
-
-    Args:
-        domain: name of the model's domain.
-        model_hash: hash of the model.
-    """
+    """Description of a model's concept space."""
     return f"{domain} (hash {model_hash})"
 
 
@@ -126,11 +121,7 @@ class Composition(Shown):
         )
 
     def __mul__(self, factor: float) -> "Composition":
-        """Multiply the guidance weights.
-
-        Raises:
-            UserError: if ``factor`` is not a finite number.
-        """
+        """Multiply the guidance weights; ``UserError`` if ``factor`` is not a finite number."""
         if not isinstance(factor, Real | Tensor) or isinstance(factor, bool):
             raise UserError(f"compose: expected a number to multiply a concept with, found {shown(factor)}")
         check_range("compose: weight", float(factor))
@@ -228,11 +219,7 @@ def _summed_modes(first: Composition, second: Composition) -> Modes | None:
 
 
 def _common(knots: Sequence[int]) -> int:
-    """Common number of knots of composed concepts.
-
-    Raises:
-        UserError: if two numbers differ and neither is 1.
-    """
+    """Common number of knots of composed concepts."""
     if len(several := sorted(set(knots) - {1})) > 1:
         raise UserError(f"compose: expected concepts of one number of knots (or of one knot), found {several[0]} and {several[1]}")
     return max(knots, default=1)
@@ -244,7 +231,7 @@ def _columns_of(compositions: Sequence[Composition]) -> int | None:
 
 
 def batched(compositions: Sequence[Composition], count: int, generators: Sequence[torch.Generator]) -> tuple[Composition, Tensor]:
-    """Collate compositions into a batch.
+    """Collate compositions into a batch; ``UserError`` for two different numbers of knots, neither of which is 1.
 
     Args:
         compositions: ``(K, ...)`` each; K may differ.
@@ -253,9 +240,6 @@ def batched(compositions: Sequence[Composition], count: int, generators: Sequenc
 
     Returns:
         Composition ``(row, max K, ...)``, padded with zero weights, and the row of each sample ``(composition * count,)``.
-
-    Raises:
-        UserError: for two different numbers of knots, neither of which is 1.
     """
     compositions = [composition.uncomposed for composition in compositions]
     knots, state = _common([composition.knots for composition in compositions]), _columns_of(compositions)

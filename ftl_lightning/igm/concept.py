@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Self
+from typing import NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -11,7 +11,6 @@ from torch import Tensor
 from ftl_lightning.igm.composition import Composition, space_of
 from ftl_lightning.igm.forms.adapter import LowRank
 from ftl_lightning.igm.forms.modes import STRETCH, Modes
-from ftl_lightning.igm.point import Part
 from ftl_lightning.services.errors import UserError, about, short, shown
 from ftl_lightning.services.shipped import shipped
 from ftl_lightning.services.tensor_file import check_finite, load_tensors, save_tensors
@@ -27,6 +26,48 @@ COMPOSING = ("composing_embeddings", "composing_weights")
 """Tensors that replace all others when composing; only in files of concepts with such a set."""
 ADAPTER = "adapter/"
 """Prefix of the tensors of an adapter."""
+EMPTY_CONCEPT, TRAINING_CONCEPT, NEW_COMPONENT = "empty concept", "training concept", "new component"
+"""Values of :attr:`Point.set`."""
+
+
+class Part(NamedTuple):
+    """An embedding of a learned concept. Numbers count from 1.
+
+    Attributes:
+        weight: weight of the component.
+        embedding: ``(n,)``.
+        component: number of the component.
+        mode: number of the mode; ``None`` without modes.
+        knot: number of the knot; ``None`` for a single knot.
+    """
+
+    weight: float
+    embedding: Tensor
+    component: int
+    mode: int | None = None
+    knot: int | None = None
+
+    @property
+    def name(self) -> str:
+        """Name such as ``'component 1'``, ``'mode 2, component 1'`` or ``'component 1, knot 3'``."""
+        mode = "" if self.mode is None else f"mode {self.mode}, "
+        return f"{mode}component {self.component}{'' if self.knot is None else f', knot {self.knot}'}"
+
+
+class Point(NamedTuple):
+    """An embedding of a concept space.
+
+    Attributes:
+        text: name of the concept.
+        set: :data:`EMPTY_CONCEPT`, :data:`TRAINING_CONCEPT` or :data:`NEW_COMPONENT`.
+        embedding: ``(n,)``.
+        part: part of a learned concept; ``None`` otherwise.
+    """
+
+    text: str
+    set: str
+    embedding: Tensor
+    part: Part | None = None
 
 
 @dataclass(frozen=True)
@@ -286,14 +327,7 @@ def file_name(concept: str) -> str:
 
 
 def _expect_shapes(tensors: Mapping[str, Tensor]) -> None:
-    """Check that the tensors of a concept are float32 with consistent shapes.
-
-    Args:
-        tensors: ``embeddings`` ``(K, knots, n)``, ``weights`` ``(K,)``; optionally :data:`MODES` and :data:`COMPOSING`.
-
-    Raises:
-        UserError: naming the first tensor with a wrong shape or dtype.
-    """
+    """Check that tensors are float32: ``embeddings (K, knots, n)``, ``weights (K,)``, and any of modes and composing."""
     shape = tuple(tensors["embeddings"].shape)
     if len(shape) != 3 or not all(shape):
         raise UserError(f"key 'embeddings': expected shape (K, knots, n), found {shape}")

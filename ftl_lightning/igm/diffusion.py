@@ -87,12 +87,7 @@ def clean_from_epsilon(noisy: Tensor, epsilon: Tensor, alpha_bar: Tensor, clip: 
 
 
 def denoising_loss(
-    epsilon: Callable[[Tensor, Tensor], Tensor],
-    clean: Tensor,
-    noise: Tensor,
-    t: Tensor,
-    alpha_bar: Tensor,
-    discount: float = 1.0,
+    epsilon: Callable[[Tensor, Tensor], Tensor], clean: Tensor, noise: Tensor, t: Tensor, alpha_bar: Tensor, discount: float = 1.0
 ) -> Tensor:
     """Squared error of the noise estimate, the integrand of Eq. 1 or, with composed noise, Eq. 2.
 

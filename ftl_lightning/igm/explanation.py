@@ -59,9 +59,7 @@ def explain(embedding: Tensor, names: Sequence[str], training: Tensor, nearest: 
 
     Args:
         embedding: ``(n,)`` in a model's concept space, whose origin is the mean of the training concepts.
-        names: names of the training concepts.
         training: embeddings of the training concepts ``(training concept, n)``.
-        nearest: number of nearest concepts.
     """
     from scipy.optimize import nnls  # slow import
 

@@ -88,7 +88,6 @@ def branches(denoiser: Denoiser, noised: Noised, concepts: Tensor, index: Tensor
 
     Args:
         denoiser: noise estimate with a single concept per sample.
-        noised: noisy plans.
         concepts: ``(concept, knots, n)``.
         index: row of ``concepts`` for each branch and plan ``(branch, batch)`` int64.
 

@@ -45,9 +45,7 @@ def invert(
     """Learn the embeddings and weights of every concept of the demonstrations, in one batch.
 
     Args:
-        model: the frozen model.
         demonstrations: demonstrations; their concept texts name the concepts.
-        settings: settings of the inversion.
         steps: maximum number of gradient steps.
         tell, watch: callbacks after each step; reading the concepts so far changes nothing.
         start: initial parameters, which are changed; ``None`` to create them.
@@ -236,11 +234,7 @@ class Inversion(nn.Module):
         return self.model.losses(states, observed, composition, draws, self.settings.loss.kind)
 
     def step_losses(self, step: int) -> Tensor:
-        """Mean losses of gradient step ``step`` ``(run,)``, over the active runs.
-
-        Raises:
-            UserError: if the mean is not finite.
-        """
+        """Mean losses of gradient step ``step`` ``(run,)``, over the active runs; ``UserError`` if the mean is not finite."""
         if self.stopping is not None and step == 0:
             self.stopping.begin(self._held_out(self.embeddings, self.weights, None))
         losses = []

@@ -7,17 +7,17 @@ import collections
 import difflib
 import itertools
 import os
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Literal
 
-from ftl_lightning.igm.concept import Concept, file_name
-from ftl_lightning.igm.summary import summary
-from ftl_lightning.services.errors import UserError, require, short, shown
+from ftl_lightning.igm.concept import ADAPTER, KIND, MODES, VERSION, Concept, Origin, QualityRecord, file_name
+from ftl_lightning.services.errors import UserError, about, require, short, shown
 from ftl_lightning.services.files import check_writable_file
-from ftl_lightning.services.tensor_file import data_folder, visible
+from ftl_lightning.services.tensor_file import check_kind, data_folder, load_header, visible
 from ftl_lightning.services.text import Shown, counted, line, say
+from ftl_lightning.services.validation import from_mapping
 
 Kind = Literal["training", "shipped", "saved"]
 CONCEPT = "concept.safetensors"
@@ -29,6 +29,53 @@ MOST_LETTERS = 60
 """Maximum length of a name in the table."""
 LONGEST_STEM = 60
 """Maximum length of a file's stem."""
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Summary of a learned concept.
+
+    Attributes:
+        origin: provenance.
+        form: such as ``'one set'``, ``'5 modes over time'`` or ``'adapter'``.
+        quality: quality of the samples; ``None`` if not measured.
+    """
+
+    origin: Origin
+    form: str
+    quality: QualityRecord | None
+
+
+def summary(path: str | Path) -> Summary | None:
+    """Summarise a concept's file. The tensors are neither read nor checked.
+
+    Returns:
+        ``None`` for another kind of file of this package, such as a model.
+
+    Raises:
+        UserError: for a file that is missing, damaged or of other software.
+        OSError: if the file cannot be read.
+    """
+    shapes, header = load_header(path, KIND)
+    if isinstance(header, dict) and isinstance(header.get("kind"), str) and header["kind"] != KIND:
+        return None
+    with about(path):
+        keys = check_kind(header, KIND, VERSION)
+        names = [field.name for field in fields(Origin)]
+        if missing := [*(key for key in names if key not in keys), *({"embeddings", "weights"} - set(shapes))]:
+            raise UserError(f"expected the keys of a concept, found none of {', '.join(missing)}")
+        origin = from_mapping(Origin, {name: keys[name] for name in names}, "")
+        quality = from_mapping(QualityRecord, keys["quality"], "quality") if keys.get("quality") is not None else None
+        return Summary(origin, _form(shapes, keys.get("mixed") is True), quality)
+
+
+def _form(shapes: Mapping[str, tuple[int, ...]], mixed: bool) -> str:
+    """Derive the form of a concept from the shapes of its tensors."""
+    modes, embeddings = shapes.get(MODES[0], ()), shapes["embeddings"]
+    parts = ["mixtures" if mixed else counted(modes[0], "mode")] if modes else []
+    parts += ["adapter"] if any(name.startswith(ADAPTER) for name in shapes) else []
+    over_time = len(embeddings) == 3 and embeddings[1] > 1
+    return f"{' and '.join(parts) or 'one set'}{' over time' if over_time else ''}"
 
 
 @dataclass(frozen=True)
@@ -135,11 +182,7 @@ class Library(Shown):
 
 
 def table(entries: Sequence[Entry]) -> str:
-    """Table of concepts in aligned columns under :data:`HEADINGS`.
-
-    Args:
-        entries: entries of a :class:`Library`.
-    """
+    """Table of concepts in aligned columns under :data:`HEADINGS`."""
     rows = [HEADINGS, *(entry.cells for entry in entries)]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return "\n".join("  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows)
@@ -167,7 +210,7 @@ def _name_in(path: Path) -> str:
 
 
 def library(model: str, training: Sequence[str], own: Path | None = None, folders: Iterable[str | Path] = ()) -> Library:
-    """Library of a model's concepts.
+    """Library of a model's concepts; ``UserError`` for an entry of ``folders`` that is not a folder.
 
     Args:
         model: hash of the model.
@@ -175,9 +218,6 @@ def library(model: str, training: Sequence[str], own: Path | None = None, folder
         own: the model's folder, with shipped concepts ``*.safetensors``; ``None`` without a folder.
         folders: folders of saved concepts ``*.safetensors``, directly or in subfolders; :func:`concepts_folder` is always
             searched.
-
-    Raises:
-        UserError: for an entry of ``folders`` that is not a folder.
     """
     places = [Path(folder) for folder in folders]
     for place in places:
@@ -211,11 +251,6 @@ def library(model: str, training: Sequence[str], own: Path | None = None, folder
 
 def concept_files(names: Iterable[str], folder: Path, place: str) -> dict[str, Path]:
     """Output files of learned concepts by name.
-
-    Args:
-        names: names of the concepts.
-        folder: folder to write.
-        place: name of the option, for messages.
 
     Raises:
         UserError: for two names with the same file, or a file that cannot be written.

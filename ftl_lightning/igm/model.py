@@ -150,7 +150,6 @@ class DiffusionModel(nn.Module):
         Args:
             compositions: ``(K, ...)`` each; K may differ.
             count: samples for each composition.
-            sampling: sampler, steps and temperature.
             generators: a noise generator for each composition.
             context: encoded observed features of each plan.
         """

@@ -80,11 +80,7 @@ class StepConfig(ModelConfig):
 
 
 def check_window(config: StepConfig, data: "PretrainingData") -> None:
-    """Refuse windows that are not a transition.
-
-    Raises:
-        UserError: with the key.
-    """
+    """Refuse windows that are not a transition; ``UserError`` with the key."""
     require(data.horizon == config.window, "data.horizon", f"{config.window} (states that a transition spans)", data.horizon)
 
 
@@ -92,8 +88,6 @@ def unroll(model: ConceptModel, config: StepConfig, predict: Callable[[Tensor | 
     """Unroll transitions to plans ``(batch, horizon, state)`` in the domain's units.
 
     Args:
-        model: one-step model.
-        config: its configuration.
         predict: ``observed vectors as the model sees them (batch, m) or None -> transitions (batch, moments, state)``, normalised.
         observed: features ``(batch, *shape)`` by name, in the domain's units.
     """

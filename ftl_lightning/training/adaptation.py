@@ -14,9 +14,8 @@ from ftl_lightning.domains.from_file import OWN
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.domains.tasks import WITHOUT_WEIGHT, EvaluationTask
 from ftl_lightning.igm.composition import Composition
-from ftl_lightning.igm.concept import Concept, file_name
+from ftl_lightning.igm.concept import NEW_COMPONENT, Concept, Point, file_name
 from ftl_lightning.igm.library import concept_files, write_concept
-from ftl_lightning.igm.point import NEW_COMPONENT, Point
 from ftl_lightning.services import log_folder
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.text import say

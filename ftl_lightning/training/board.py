@@ -47,7 +47,7 @@ class Board(TensorBoardLogger):
         super().log_metrics({tag(name): value for name, value in metrics.items() if name != "epoch"}, step)
 
 
-TAG = "optimizer/learning rate"
+TAG, NUMBER = "optimizer/learning rate", re.compile(r"\.\d+(?=\.|$)")
 
 
 class LearningRate(pl.Callback):
@@ -63,21 +63,13 @@ class LearningRate(pl.Callback):
 
 
 def rates(module: pl.LightningModule, optimizer: Optimizer) -> dict[str, float]:
-    """Learning rates by tag.
-
-    Args:
-        module: module with the parameters.
-        optimizer: optimiser of the parameters.
-    """
+    """Learning rates by tag."""
     groups: list[dict[str, Any]] = optimizer.param_groups
     if len(groups) == 1:
         return {TAG: float(groups[0]["lr"])}
     names = {id(parameter): name for name, parameter in module.named_parameters()}
-    return {f"{TAG}/{_label(names.get(id(group['params'][0]), 'others'))}": float(group["lr"]) for group in groups}
-
-
-def _label(name: str) -> str:
-    return re.sub(r"\.\d+(?=\.|$)", "", name)
+    named = [(names.get(id(group["params"][0]), "others"), float(group["lr"])) for group in groups]
+    return {f"{TAG}/{re.sub(NUMBER, '', name)}": rate for name, rate in named}
 
 
 REFRESH = 0.5

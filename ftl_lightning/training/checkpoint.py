@@ -43,11 +43,7 @@ class WholeCheckpoints(TorchCheckpointIO):
     """
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
-        """Write a checkpoint atomically.
-
-        Raises:
-            UserError: if the folder cannot be written or the disk is full.
-        """
+        """Write a checkpoint atomically; ``UserError`` if the folder cannot be written or the disk is full."""
         if "://" in str(path):  # a store without renaming
             super().save_checkpoint(checkpoint, path, storage_options)
             return
@@ -81,7 +77,8 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     try:
         return _read(Path(path))
     except UserError as error:
-        checkpoints = sorted(_beside(Path(path)), key=lambda checkpoint: checkpoint.stat().st_mtime, reverse=True)
+        others = [checkpoint for checkpoint in visible(Path(path).parent, "*.ckpt") if checkpoint.name != Path(path).name]
+        checkpoints = sorted(others, key=lambda checkpoint: checkpoint.stat().st_mtime, reverse=True)
         if whole := next((checkpoint for checkpoint in checkpoints if _is_whole(checkpoint)), None):
             raise UserError(f"{error}; go on from the newest whole one: --ckpt_path {whole}") from error.__cause__
         raise
@@ -123,11 +120,6 @@ def _is_whole(path: Path) -> bool:
     return True
 
 
-def _beside(path: Path) -> list[Path]:
-    """Other checkpoints of the folder."""
-    return [checkpoint for checkpoint in visible(path.parent, "*.ckpt") if checkpoint.name != path.name]
-
-
 def last_checkpoint(trainer: pl.Trainer) -> Path | None:
     """The newest of the last checkpoints of the trainer's callbacks; ``None`` without any."""
     callbacks = [callback for callback in trainer.checkpoint_callbacks if isinstance(callback, ModelCheckpoint)]
@@ -137,10 +129,6 @@ def last_checkpoint(trainer: pl.Trainer) -> Path | None:
 
 def check_parameters(found: Mapping[str, Any], module: pl.LightningModule) -> None:
     """Refuse checkpoint parameters that do not fit a module.
-
-    Args:
-        found: parameters of the checkpoint, by name.
-        module: module with its layers.
 
     Raises:
         UserError: for the first missing, unknown or non-finite parameter, or another shape.
@@ -157,10 +145,6 @@ def check_parameters(found: Mapping[str, Any], module: pl.LightningModule) -> No
 
 def check_restored(module: pl.LightningModule, step: int) -> None:
     """Refuse inconsistent state that Lightning and torch accepted.
-
-    Args:
-        module: module with a starting trainer.
-        step: step of the checkpoint.
 
     Raises:
         UserError: for another step, an optimiser without state, or state whose shapes differ from the parameters'.
@@ -212,11 +196,7 @@ class Random(NamedTuple):
 
     @classmethod
     def read(cls, checkpoint: Mapping[str, Any]) -> "Random":
-        """Read from a checkpoint.
-
-        Raises:
-            UserError: for missing or damaged states.
-        """
+        """Read from a checkpoint; ``UserError`` for missing or damaged states."""
         try:
             states = cls(**checkpoint[_RANDOM])
             torch.Generator().set_state(states.cpu)
@@ -228,15 +208,7 @@ class Random(NamedTuple):
 
 
 def check_signature(expected: Mapping[str, Any], checkpoint: Mapping[str, Any]) -> None:
-    """Refuse a checkpoint with another signature.
-
-    Args:
-        expected: settings that must match.
-        checkpoint: content of the checkpoint.
-
-    Raises:
-        UserError: with the first key that differs.
-    """
+    """Refuse a checkpoint with another signature; ``UserError`` with the first key that differs."""
     signature = checkpoint.get(SIGNATURE, {})
     for key in expected | signature:
         value, setting = signature.get(key), expected.get(key)

@@ -52,8 +52,7 @@ class Known:
     @property
     def clear(self) -> bool:
         """Whether it explains nearly all demonstrations, and their mean loss."""
-        mean = sum(self.losses) / len(self.losses)
-        return self.count >= MOST_OF * len(self.losses) and mean <= MARGIN
+        return self.count >= MOST_OF * len(self.losses) and sum(self.losses) / len(self.losses) <= MARGIN
 
     def __str__(self) -> str:
         mean = sum(self.losses) / len(self.losses)
@@ -146,18 +145,11 @@ def check_with(
     found: tuple[Finding, ...] = (),
     progress: bool = False,
 ) -> Check:
-    """Check demonstrations of one concept with a model.
+    """Check demonstrations of one concept with a model; ``UserError`` for a model without inversion.
 
     Args:
-        model: the frozen model.
         demonstrations: demonstrations of one concept that fit the model.
-        settings: settings of the inversion.
         steps: maximum number of gradient steps on subsets; 0 to learn nothing.
-        found: earlier findings.
-        progress: show a bar.
-
-    Raises:
-        UserError: for a model without inversion.
     """
     model.check_settings(settings)
     name = demonstrations.concepts[0]
@@ -175,14 +167,9 @@ def check_with(
 
 
 def longer_than_plans(demonstrations: Demonstrations, model: ConceptModel) -> str:
-    """Note about the use of demonstrations that are longer than the model's plans.
+    """Note about the use of demonstrations that are longer than the model's plans; empty without any.
 
-    Empty if demonstrations are not longer, or in closed-loop domains with observations at every time, where a plan may start at
-    any time.
-
-    Args:
-        demonstrations: demonstrations to learn from.
-        model: pretrained model.
+    A plan may start at any time in closed-loop domains with observations at every time, which need no note.
     """
     window, plans = model.window, model.domain.plans
     longest, shortest = int(demonstrations.lengths.max()), int(demonstrations.lengths.min())
@@ -207,12 +194,7 @@ def longer_than_plans(demonstrations: Demonstrations, model: ConceptModel) -> st
 
 @torch.no_grad()
 def scale_findings(model: ConceptModel, demonstrations: Demonstrations) -> tuple[Finding, ...]:
-    """Warn if many values of states or observed vectors are outside the pretraining range, or some are far outside.
-
-    Args:
-        model: pretrained model.
-        demonstrations: demonstrations that fit the model.
-    """
+    """Warn if many values of states or observed vectors are outside the pretraining range, or some are far outside."""
     return tuple(_scale(model, demonstrations))
 
 
@@ -267,16 +249,7 @@ def _range_finding(what: str, values: Tensor, names: "list[str] | tuple[str, ...
 
 
 def check_concept(model: ConceptModel, concept: Concept, path: str | Path) -> None:
-    """Refuse a learned concept of another model.
-
-    Args:
-        model: the model.
-        concept: the learned concept.
-        path: file of the concept.
-
-    Raises:
-        UserError: if encoder, domain, pretrained model or sizes differ.
-    """
+    """Refuse a learned concept of another model; ``UserError`` if encoder, domain, pretrained model or sizes differ."""
     of_model = {"encoder": model.config.encoder, "domain": model.config.domain, "pretrained": model.hash}
     for key, expected in of_model.items():
         value, wanted = getattr(concept.origin, key), f"{expected!r} (the pretrained model's)"
@@ -286,11 +259,7 @@ def check_concept(model: ConceptModel, concept: Concept, path: str | Path) -> No
 
 
 def check_sizes(model: ConceptModel, concept: Concept) -> None:
-    """Refuse a concept whose sizes do not fit a model.
-
-    Raises:
-        UserError: with the key.
-    """
+    """Refuse a concept whose sizes do not fit a model; ``UserError`` with the key."""
     place, size = "key 'embeddings'", model.config.concept_dim
     require(concept.embeddings.shape[2] == size, place, f"{size} numbers each", concept.embeddings.shape[2])
     require(concept.knots == 1 or model.over_time, place, "1 knot for this model", concept.knots)

@@ -12,12 +12,11 @@ from torch import Tensor, nn
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import READ, Feature, Observed, check_features, moved
 from ftl_lightning.igm.composition import Composition
-from ftl_lightning.igm.concept import Concept, Origin
+from ftl_lightning.igm.concept import EMPTY_CONCEPT, TRAINING_CONCEPT, Concept, Origin, Point
 from ftl_lightning.igm.forms.adapter import LowRank
 from ftl_lightning.igm.forms.choice import learn
 from ftl_lightning.igm.inversion import Inversion, Tell, Watch
 from ftl_lightning.igm.model import Draws
-from ftl_lightning.igm.point import EMPTY_CONCEPT, TRAINING_CONCEPT, Point
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.igm.settings import ADAPTED, AUTO, MIXED, MODES, ONE, PAPER, InversionSettings
 from ftl_lightning.networks.image_encoder import ImageEncoders
@@ -102,7 +101,6 @@ class ConceptModel(Shown, nn.Module, ABC):
         Args:
             compositions: ``(K, ...)`` each; K may differ.
             count: samples for each composition.
-            sampling: sampler, steps and temperature.
             generators: a noise generator for each composition, so that samples do not depend on the rest of the batch.
             observed: features ``(composition * count, *shape)`` by name, in the domain's units; ``None`` for none.
 
@@ -124,15 +122,7 @@ class ConceptModel(Shown, nn.Module, ABC):
         A model that is not :attr:`invertible` reads its concepts from the demonstrations, see :meth:`read_concepts`.
 
         Args:
-            demonstrations: demonstrations; their concept texts name the concepts.
-            settings: settings of the inversion; ignored without gradient descent.
-            steps: maximum number of gradient steps.
-            tell: called with the mean loss after each step.
-            watch: called after each step of the first inversion, see :data:`~ftl_lightning.igm.inversion.Watch`.
-            start: parameters of the first inversion, which are changed; ``None`` to create them.
-
-        Returns:
-            Concepts by name.
+            demonstrations, settings, steps, tell, watch, start: see :func:`~ftl_lightning.igm.forms.choice.learn`.
 
         Raises:
             UserError: for settings that the model does not support, or a loss that is not finite.
@@ -150,11 +140,7 @@ class ConceptModel(Shown, nn.Module, ABC):
         raise NotImplementedError
 
     def check_settings(self, settings: InversionSettings) -> None:
-        """Refuse settings that the model does not support.
-
-        Raises:
-            UserError: with the key.
-        """
+        """Refuse settings that the model does not support; ``UserError`` with the key."""
         name, adapts = self.method.name, bool(self.adaptable())
         require(self.invertible, "model.pretrained", "a model that concepts are learned through", f"one of {name}")
         off_span, knots = settings.embeddings.off_span, settings.embeddings.knots
@@ -171,9 +157,7 @@ class ConceptModel(Shown, nn.Module, ABC):
 
         Args:
             demonstrations: demonstrations, including the concept's.
-            name: name of the concept.
             weights: ``'fixed'`` or ``'learned'``.
-            loss: final loss.
             pretrained: the model's hash, if known (hashing takes as long as several steps).
         """
         selected, space = demonstrations.select(name), (self.config.domain, self.config.encoder, pretrained or self.hash)
@@ -189,7 +173,6 @@ class ConceptModel(Shown, nn.Module, ABC):
         """Training windows ``(row, window, state)`` and their observed features, on the model's device.
 
         Args:
-            demonstrations: demonstrations.
             rows: row of the demonstration of each window ``(row,)``.
             share: relative start of each window ``(row,)``, 0 to 1.
             draw: generator of the perturbation, if the model is configured with one.
@@ -200,7 +183,7 @@ class ConceptModel(Shown, nn.Module, ABC):
         return self.perturbed(states.to(self.device), moved(observed, self.device), draw)
 
     def losses(self, states: Tensor, observed: Observed, composition: Composition, draws: Draws | None, loss: str) -> Tensor:
-        """Losses of behaviour under concepts, for inversion by gradient descent.
+        """Losses ``(run, sample)`` of behaviour under concepts, for inversion by gradient descent.
 
         Args:
             states: ``(run * sample, window, state)`` in the domain's units.
@@ -208,9 +191,6 @@ class ConceptModel(Shown, nn.Module, ABC):
             composition: ``(run, K, ...)``.
             draws: result of :meth:`draws`.
             loss: target of a diffusion model's squared error.
-
-        Returns:
-            ``(run, sample)``.
         """
         raise NotImplementedError
 
@@ -250,11 +230,7 @@ class ConceptModel(Shown, nn.Module, ABC):
         return self.empty.device
 
     def concept(self, text: str) -> Tensor:
-        """The embedding ``(n,)`` of a training concept.
-
-        Raises:
-            UserError: for an unknown text, with the nearest training concepts.
-        """
+        """The embedding ``(n,)`` of a training concept; ``UserError`` for an unknown text, with the nearest training concepts."""
         known = self.config.training_concepts
         if text not in known:
             near = difflib.get_close_matches(str(text), known, n=NEAREST, cutoff=0)
@@ -274,11 +250,7 @@ class ConceptModel(Shown, nn.Module, ABC):
         return {}
 
     def check_adapter(self, adapter: LowRank) -> None:
-        """Refuse an adapter that does not fit.
-
-        Raises:
-            UserError: naming the weight; always for a method without adapters.
-        """
+        """Refuse an adapter that does not fit; ``UserError`` naming the weight; always for a method without adapters."""
         raise UserError(f"key 'adapter': expected none for a model of {self.method.name}, found one")
 
     def perturbed(self, states: Tensor, observed: Observed, draw: torch.Generator) -> tuple[Tensor, Observed]:
@@ -297,14 +269,11 @@ class ConceptModel(Shown, nn.Module, ABC):
         return states if self.view is None else self.view.decode(states, observed)
 
     def vector(self, observed: Observed) -> Tensor | None:
-        """Observation vector ``(batch, m)`` of the network: normalised vectors, then image encodings.
+        """Observation vector ``(batch, m)`` of the network: normalised vectors, then image encodings; ``None`` without any.
 
         Args:
             observed: features by name, in the domain's units; :data:`~ftl_lightning.data.features.READ`, the result of
                 :meth:`of_images`, may replace the images.
-
-        Returns:
-            ``None`` if nothing is observed.
 
         Raises:
             UserError: for a missing feature or another shape.

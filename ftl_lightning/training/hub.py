@@ -26,26 +26,10 @@ def is_repository(name: str) -> bool:
     return bool(slash) and "/" not in rest and owner not in FOLDERS and not owner.startswith((".", "~"))
 
 
-def check_repository(repository: object) -> str:
-    """Refuse an invalid name of a repository.
-
-    Raises:
-        UserError: with an example.
-    """
-    if not isinstance(repository, str) or not _REPOSITORY.fullmatch(repository):
-        raise UserError(f"repository: expected a name on the Hub, such as 'owner/name', found {shown(repository)}")
-    return repository
-
-
 def download(
     repository: str, files: Sequence[str] = MODEL_FILES, expected: str = "a folder, a model that ships or one on the Hub"
 ) -> Path:
     """Download the model or concept ``owner/name``, or take it from the cache, and return its folder.
-
-    Args:
-        repository: name of the repository.
-        files: patterns of the files to download.
-        expected: expected kinds of names, for messages.
 
     Raises:
         UserError: if the download fails.
@@ -59,20 +43,14 @@ def download(
 
 
 def upload(write: Callable[[Path], object], repository: str, private: bool = False) -> str:
-    """Upload a folder as ``owner/name``; needs a login.
+    """Upload a folder as ``owner/name`` and return its address; ``UserError`` for an invalid name or a failed upload.
 
     Args:
         write: writes the files into a folder; not called for an invalid name.
-        repository: the name.
         private: whether a new repository is private.
-
-    Returns:
-        The address.
-
-    Raises:
-        UserError: for an invalid name, or if the upload fails.
     """
-    check_repository(repository)
+    if not isinstance(repository, str) or not _REPOSITORY.fullmatch(repository):
+        raise UserError(f"repository: expected a name on the Hub, such as 'owner/name', found {shown(repository)}")
     with tempfile.TemporaryDirectory() as folder:
         write(Path(folder))
         from huggingface_hub import HfApi

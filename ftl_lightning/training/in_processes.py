@@ -21,17 +21,7 @@ from ftl_lightning.training.model_folder import load_model
 
 @dataclass(frozen=True)
 class _Share:
-    """Work of one process.
-
-    Attributes:
-        folder: folder of the demonstrations and learned concepts.
-        model: folder or name of the pretrained model.
-        concepts: file numbers and texts of concepts.
-        settings: settings of the inversion.
-        steps: gradient steps.
-        device: device to learn on.
-        vouched: modules that the user trusts.
-    """
+    """Work of one process: file numbers and texts of concepts, and the folder of demonstrations and learned concepts."""
 
     folder: str
     model: str
@@ -43,12 +33,7 @@ class _Share:
 
 
 def learned_in_processes(
-    model: str,
-    device: torch.device,
-    demonstrations: Demonstrations,
-    settings: InversionSettings,
-    steps: int,
-    processes: int,
+    model: str, device: torch.device, demonstrations: Demonstrations, settings: InversionSettings, steps: int, processes: int
 ) -> dict[str, Concept]:
     """Learn the concepts of the demonstrations in several processes.
 
@@ -58,8 +43,6 @@ def learned_in_processes(
         model: folder or name of the pretrained model.
         device: device to learn on; with several GPUs, processes take them in turn.
         demonstrations: demonstrations; their concept texts name the concepts.
-        settings: settings of the inversion.
-        steps: gradient steps.
         processes: maximum number of processes; at most one for each concept.
 
     Raises:
@@ -75,10 +58,7 @@ def learned_in_processes(
             for first in range(min(processes, len(names)))
         ]
         # Spawned, since a forked process would share threads and devices.
-        with (
-            ProcessPoolExecutor(len(shares), multiprocessing.get_context("spawn")) as pool,
-            bar("concepts", len(names)) as advance,
-        ):
+        with ProcessPoolExecutor(len(shares), multiprocessing.get_context("spawn")) as pool, bar("concepts", len(names)) as advance:
             running = {pool.submit(_learn, share): len(share.concepts) for share in shares}
             try:
                 for ended in as_completed(running):

@@ -29,9 +29,7 @@ def labels(method: Method, traits: Sequence[str], settings: InversionSettings, h
     """Labels of an inversion.
 
     Args:
-        method: method of the pretrained model.
         traits: suffixes of the model's name, see :attr:`~ftl_lightning.training.concept_model.ConceptModel.traits`.
-        settings: settings of the inversion.
         hparams: options by flat name, see :data:`~ftl_lightning.igm.settings.INVERSION`.
     """
     embeddings, weights, adapter = settings.embeddings, settings.weights, settings.adapter

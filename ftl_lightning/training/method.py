@@ -60,11 +60,7 @@ class Method:
     suits: "Callable[[Domain], None]" = lambda domain: None
 
     def check_domain(self, domain: "Domain") -> None:
-        """Refuse an unsupported domain.
-
-        Raises:
-            UserError: with what the domain lacks.
-        """
+        """Refuse an unsupported domain; ``UserError`` with what the domain lacks."""
         with about(f"method {self.name}"):
             self.suits(domain)
 
@@ -74,21 +70,13 @@ class Method:
 
 
 def check_present(domain: "Domain") -> None:
-    """Refuse domains without observations.
-
-    Raises:
-        UserError: with the domain.
-    """
+    """Refuse domains without observations; ``UserError`` with the domain."""
     reason = f"{domain.name}: there is no present to go on from"
     require(domain.observed, "domain", "one with observed features", reason)
 
 
 def check_present_or_moment(domain: "Domain") -> None:
-    """Refuse domains without observations, unless plans are single states.
-
-    Raises:
-        UserError: with the domain.
-    """
+    """Refuse domains without observations, unless plans are single states; ``UserError`` with the domain."""
     if domain.plans.horizon > 1:
         check_present(domain)
 
@@ -117,11 +105,7 @@ def _ours() -> dict[str, str]:
 
 
 def load_method(name: str) -> Method:
-    """Load a method by name.
-
-    Raises:
-        UserError: for an unknown name or another object.
-    """
+    """Load a method by name; ``UserError`` for an unknown name or another object."""
     offered = _ours() if name in SHIPPED else _offered()
     if name not in offered:
         raise UserError(f"method: expected one of {', '.join(method_names())}, found {short(name)!r}")

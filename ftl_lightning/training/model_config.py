@@ -61,11 +61,7 @@ class ModelConfig(Sizes):
 
 
 def find_view(domain: Domain, name: str) -> View | None:
-    """A domain's view by name; ``None`` for the empty name.
-
-    Raises:
-        UserError: for an unknown name.
-    """
+    """A domain's view by name; ``None`` for the empty name; ``UserError`` for an unknown name."""
     if not name:
         return None
     if name not in domain.views:
@@ -92,11 +88,7 @@ def read_config(folder: str | Path) -> dict[str, Any]:
 
 
 def check_domain(config: ModelConfig, domain: Domain) -> None:
-    """Refuse sizes that differ from the domain's.
-
-    Raises:
-        UserError: with the key.
-    """
+    """Refuse sizes that differ from the domain's; ``UserError`` with the key."""
     if config.state_dim != (columns := len(domain.plans.columns)):
         raise UserError(f"key 'state_dim': expected {columns} (domain {domain.name}), found {config.state_dim}")
     if config.metrics and config.domain != OWN:
@@ -132,12 +124,7 @@ class Prepared(Generic[C]):
     observed: Normalization | None = None
 
     def configured(self, kind: type[K], **options: Any) -> "Prepared[K]":
-        """Copy with the configuration of a method's network.
-
-        Args:
-            kind: class of the configuration.
-            options: additional or replaced fields of the configuration.
-        """
+        """Copy with the configuration of a method's network."""
         known = {field.name: getattr(self.config, field.name) for field in fields(self.config)}
         return Prepared(kind(**known | options), self.domain, self.normalization, self.embeddings, self.observed)
 

@@ -48,7 +48,6 @@ def read_model(kind: type[M], folder: str | Path, domain: Domain | None = None) 
     """Read a folder written by :func:`save_model`; the model is frozen and in evaluation mode.
 
     Args:
-        kind: the model's class.
         folder: folder to read.
         domain: replaces the folder's domain; ``None`` for the folder's, which must be installed or given by the user with the
             folder.
@@ -126,11 +125,7 @@ def at_most(numbers: int) -> Iterator[None]:
 
 
 def check_weights(found: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> None:
-    """Refuse tensors that do not fit a model or are not finite.
-
-    Raises:
-        UserError: with the first such tensor.
-    """
+    """Refuse tensors that do not fit a model or are not finite; ``UserError`` with the first such tensor."""
     for name in [*expected, *found]:
         if name not in found or name not in expected:
             message = "expected it, found nothing" if name not in found else "expected nothing, found it"
@@ -172,12 +167,9 @@ def load_model(folder: str | Path, domain: Domain | str | None = None) -> Concep
 
 
 def find_model(model_hash: str, places: Sequence[Path]) -> Path:
-    """Find the folder of the model with this hash below ``places``; a known domain is preferred.
+    """Find the folder of the model with this hash below ``places``; a known domain is preferred; ``UserError`` if there is none.
 
     Configurations are read as data; nothing that they name is imported.
-
-    Raises:
-        UserError: if there is none.
     """
     matches = []
     for path in (path for place in places for path in sorted(place.rglob(CONFIG))):

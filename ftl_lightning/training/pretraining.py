@@ -19,7 +19,7 @@ from ftl_lightning.data.normalization import Normalization
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.tasks import WITHOUT_WEIGHT, EvaluationTask
 from ftl_lightning.igm.composition import Composition
-from ftl_lightning.igm.point import Point
+from ftl_lightning.igm.concept import Point
 from ftl_lightning.networks.image_encoder import ImageEncoders
 from ftl_lightning.networks.text_encoder import EMPTY
 from ftl_lightning.services.errors import UserError
@@ -127,7 +127,6 @@ class Pretraining(pl.LightningModule, ABC, Generic[M]):
         Args:
             prepared: configuration and text embeddings; a method adds options of its network by
                 :meth:`~ftl_lightning.training.model_config.Prepared.configured`.
-            data: training data.
         """
 
     @abstractmethod
@@ -351,11 +350,7 @@ class Pretraining(pl.LightningModule, ABC, Generic[M]):
 
 
 def check_dropout(shares: Mapping[str, float], features: Mapping[str, Feature]) -> dict[str, float]:
-    """Check and return the probabilities.
-
-    Raises:
-        UserError: for a name that is not an observed vector.
-    """
+    """Check and return the probabilities; ``UserError`` for a name that is not an observed vector."""
     vectors = [name for name, feature in features.items() if feature.kind == "vector"]
     for name in shares:
         if name not in vectors:
@@ -365,11 +360,7 @@ def check_dropout(shares: Mapping[str, float], features: Mapping[str, Feature]) 
 
 
 def check_shown(concepts: Sequence[str], shown: Sequence[str]) -> None:
-    """Refuse training concepts without demonstrations, for in-context methods.
-
-    Raises:
-        UserError: with the first such concept.
-    """
+    """Refuse training concepts without demonstrations, for in-context methods; ``UserError`` with the first such concept."""
     if absent := [text for text in concepts if text not in set(shown)]:
         raise UserError(
             f"data: expected a demonstration of each of {len(concepts)} training concepts, found none of {len(absent)}, such as "

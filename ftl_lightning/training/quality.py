@@ -25,14 +25,7 @@ SHOWN = 16
 
 
 def right_plans(measured: Mapping[str, Tensor]) -> tuple[str, Tensor] | None:
-    """Which plans are right: the first boolean metric per plan.
-
-    Args:
-        measured: values of a domain's metrics by name, see :meth:`~ftl_lightning.domains.domain.Domain.measure`.
-
-    Returns:
-        Name and values ``(sample,)`` of the metric; ``None`` without such a metric.
-    """
+    """Name and values ``(sample,)`` of the first boolean metric per plan, of metrics by name; ``None`` without such a metric."""
     return next(((name, values) for name, values in measured.items() if values.dtype == torch.bool and values.dim()), None)
 
 
@@ -116,11 +109,8 @@ def inspected(model: ConceptModel, domain: Domain, demonstrations: Demonstration
     """Inspect samples of a learned concept.
 
     Args:
-        model: generative model.
         domain: domain whose first success metric judges samples, if it can read the concept's name.
         demonstrations: two or more demonstrations of the concept.
-        concept: learned concept.
-        seed: seed of the samples.
     """
     name = concept.origin.name
     samples, starts = generated(model, demonstrations, {name: concept}, seed)

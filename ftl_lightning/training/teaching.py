@@ -9,7 +9,7 @@ from torch import Tensor
 from ftl_lightning.data.features import READ, Observed, take
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.networks.image_encoder import ImageEncoders
-from ftl_lightning.services.errors import UserError, short
+from ftl_lightning.services.errors import UserError, require, short
 from ftl_lightning.services.validation import LARGEST_FACTOR, check_range
 from ftl_lightning.training.data import Batch
 
@@ -40,13 +40,10 @@ class Teaching:
             if known is None or images is None:
                 names = ", ".join(domain.privileged) if images is not None else "none, as no image is observed"
                 raise UserError(f"model.privileged: expected {names or 'none'} (domain {domain.name}), found {short(name)!r}")
-            if images.size != known.feature.size:
-                raise UserError(
-                    f"model.privileged.{name}: expected image_encoder of {known.feature.shape[0]} points, "
-                    f"found one that reads {images.size} numbers"
-                )
-            if self.share and known.told is None:
-                raise UserError(f"model.told: expected 0, as nothing tells what is read of {name!r}, found {self.share}")
+            place, expected = f"model.privileged.{name}", f"image_encoder of {known.feature.shape[0]} points"
+            require(images.size == known.feature.size, place, expected, f"one that reads {images.size} numbers")
+            tells = not self.share or known.told is not None
+            require(tells, "model.told", f"0, as nothing tells what is read of {name!r}", self.share)
 
     def attach(self, images: ImageEncoders | None) -> None:
         """Keep the outputs of image encoders."""

@@ -98,11 +98,7 @@ class _Begun(pl.Callback):
 
 
 def _expect_monitors(trainer: pl.Trainer) -> None:
-    """Refuse a callback that monitors a metric which is not logged: it would have no effect.
-
-    Raises:
-        UserError: naming the callback and the logged metrics.
-    """
+    """Refuse a callback that monitors a metric which is not logged: it would have no effect."""
     for callback in trainer.callbacks:  # type: ignore[attr-defined]
         watched = getattr(callback, "monitor", None)
         if isinstance(watched, str) and watched not in trainer.callback_metrics:
@@ -145,11 +141,7 @@ class Trainer(pl.Trainer):
             self.strategy.checkpoint_io = WholeCheckpoints()
 
     def check_alone(self, verb: str) -> None:
-        """Refuse several processes for a verb that runs in one process.
-
-        Raises:
-            UserError: naming the verb.
-        """
+        """Refuse several processes for a verb that runs in one process; ``UserError`` naming the verb."""
         instead = "use trainer.processes" if verb == "invert" else "`fit` alone runs on several"
         processes = self.num_devices * self.num_nodes
         require(processes == 1, "trainer.devices", f"1 for {verb}", f"{processes}; {instead}")
@@ -189,11 +181,7 @@ class Trainer(pl.Trainer):
             return super().test(*arguments, **options)
 
     def _check_exact(self) -> None:
-        """Refuse several processes unless each is started separately and holds all weights.
-
-        Raises:
-            UserError: naming the strategy.
-        """
+        """Refuse several processes unless each is started separately and holds all weights."""
         separate = isinstance(self.strategy.launcher, _SubprocessScriptLauncher | None)
         exact = self.world_size == 1 or (separate and isinstance(self.strategy, DDPStrategy))
         name = f"{type(self.strategy).__name__} with {type(self.strategy.launcher).__name__}"
@@ -216,12 +204,7 @@ class Trainer(pl.Trainer):
             ) from error
 
     def invert(self, model: Adaptation, datamodule: pl.LightningDataModule) -> None:
-        """Learn the concepts, write them to files, then generate and judge samples.
-
-        Args:
-            model: adapts a pretrained model.
-            datamodule: demonstrations.
-        """
+        """Learn the concepts, write them to files, then generate and judge samples."""
         adapts = isinstance(model, Adaptation)
         require(adapts, "model.class_path", "a module that adapts a pretrained model", type(model).__name__)
         self.verb = "invert"
@@ -237,11 +220,7 @@ class Trainer(pl.Trainer):
 
 
 def _check_options(options: dict[str, Any]) -> None:
-    """Refuse values that Lightning does not check.
-
-    Raises:
-        UserError: with option, range and value.
-    """
+    """Refuse values that Lightning does not check."""
     for least, names in LEAST.items():
         for name in names:
             value = options.get(name)

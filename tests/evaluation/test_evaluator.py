@@ -36,7 +36,7 @@ from ftl_lightning.evaluation.generation import (
 from ftl_lightning.evaluation.results import Row, append_rows, config_hash, configuration, read_rows, reference_hash
 from ftl_lightning.evaluation.tensorboard import picture
 from ftl_lightning.igm.composition import Composition
-from ftl_lightning.igm.point import Point
+from ftl_lightning.igm.concept import Point
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.training.model_folder import read_model

@@ -14,7 +14,7 @@ from tensorboard.plugins.hparams.backend_context import Context
 
 from ftl_lightning.evaluation.results import Row
 from ftl_lightning.evaluation.tensorboard import log_animation, log_projector, log_test, setting_means
-from ftl_lightning.igm.point import Part, Point
+from ftl_lightning.igm.concept import Part, Point
 from tests.evaluation.rows import REFERENCE
 from tests.evaluation.rows import row as usual_row
 

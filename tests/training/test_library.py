@@ -11,8 +11,7 @@ import torch
 from ftl_lightning.cli.main import main
 from ftl_lightning.igm.concept import KIND, VERSION, Concept, Origin, QualityRecord
 from ftl_lightning.igm.forms.modes import Modes
-from ftl_lightning.igm.library import HEADINGS, concepts_folder, library
-from ftl_lightning.igm.summary import summary
+from ftl_lightning.igm.library import HEADINGS, concepts_folder, library, summary
 from ftl_lightning.services.errors import LONGEST, UserError
 from ftl_lightning.services.tensor_file import save_tensors
 from tests.conftest import ROOT, refused

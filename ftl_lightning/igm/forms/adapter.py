@@ -39,11 +39,7 @@ class LowRank:
         return weight + (up @ down).reshape(weight.shape)
 
     def check_fits(self, network: nn.Module) -> None:
-        """Check that every factor fits a weight of a network.
-
-        Raises:
-            UserError: naming the first factor that does not fit.
-        """
+        """Check that every factor fits a weight of a network; ``UserError`` naming the first factor that does not fit."""
         known = adaptable(network)
         for name, (up, down) in self.factors.items():
             sizes, place = (len(up), down.shape[1]), f"key 'adapter/{short(name)}'"
@@ -68,11 +64,7 @@ class LowRank:
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Tensor], everywhere: bool = False) -> "LowRank":
-        """Inverse of :meth:`tensors`.
-
-        Raises:
-            UserError: for a missing factor, inconsistent shapes or a wrong dtype.
-        """
+        """Inverse of :meth:`tensors`; ``UserError`` for a missing factor, inconsistent shapes or a wrong dtype."""
         names = dict.fromkeys(name.rpartition("/")[0] for name in tensors)
         for name in names:
             up, down = (tensors.get(f"{name}/{kind}") for kind in KINDS)

@@ -32,6 +32,7 @@ not seen in pretraining, see docs/experiments-forms.md.
 NARROW, WIDE = 0.65, 0.75
 """Spread of samples, relative to demonstrations: below the first value mixtures replace one set; mixtures above the second are
 stretched less."""
+Concepts = Mapping[str, Concept]
 SPAN_LOSS = 1.03
 """Maximum ratio of leave-one-out losses, in the span of the training concepts to free, to compose a concept from a set in the
 span."""
@@ -65,9 +66,7 @@ def learn(
 
 def first_settings(settings: InversionSettings) -> InversionSettings:
     """Settings of the first inversion: unchanged in the paper's form, else one set without an adapter."""
-    if settings.form in (UNSAID, PAPER):
-        return settings
-    return _one_set(settings)
+    return settings if settings.form in (UNSAID, PAPER) else _one_set(settings)
 
 
 def _one_set(settings: InversionSettings, **changes: Any) -> InversionSettings:
@@ -78,12 +77,7 @@ def _one_set(settings: InversionSettings, **changes: Any) -> InversionSettings:
 
 
 def _with_modes(
-    model: Invertible,
-    demonstrations: Demonstrations,
-    settings: InversionSettings,
-    steps: int,
-    first: Mapping[str, Concept],
-    tell: Tell,
+    model: Invertible, demonstrations: Demonstrations, settings: InversionSettings, steps: int, first: Concepts, tell: Tell
 ) -> dict[str, Concept]:
     """The first concepts with a mode for each demonstration, learned without early stopping, since samples depend on modes."""
     alone = settings.from_one_start(form=PAPER, modes=1, adapter=0, samples=MODE_SAMPLES, tolerance=None)
@@ -104,23 +98,16 @@ def _adapted(
     rank, rate = (adapter.rank, adapter.learning_rate) if adapter.rank else (RANK, RATE)
     changes = {"modes": "each" if mixed else 1, "adapter": rank, "adapter_learning_rate": rate, "tolerance": None}
     concepts = invert(model, demonstrations, settings.from_one_start(form=PAPER, **changes), min(steps, ADAPTER_STEPS), tell)
-    return {
-        name: replace(concept, modes=replace(concept.modes, mixed=True, stretch=even_stretch(len(concept.modes))))
-        if concept.modes
-        else concept
-        for name, concept in concepts.items()
-    }
+    for name, concept in concepts.items():
+        if concept.modes:
+            modes = replace(concept.modes, mixed=True, stretch=even_stretch(len(concept.modes)))
+            concepts[name] = replace(concept, modes=modes)
+    return concepts
 
 
 @dataclass(frozen=True)
 class _Shares:
-    """Losses of one set of embeddings, relative to the unconditional loss on the same demonstrations.
-
-    Attributes:
-        own: training loss.
-        left_out: mean leave-one-out loss; ``None`` for fewer than three demonstrations.
-        in_span: mean leave-one-out loss in the span of the training concepts; ``None`` also for models without text concepts.
-    """
+    """Relative training, mean leave-one-out (``None`` for under three) and in-span (``None`` without texts) losses of a set."""
 
     own: float
     left_out: float | None = None
@@ -147,12 +134,7 @@ class _Shares:
 
 
 def _loss_shares(
-    model: Invertible,
-    demonstrations: Demonstrations,
-    settings: InversionSettings,
-    steps: int,
-    first: Mapping[str, Concept],
-    tell: Tell,
+    model: Invertible, demonstrations: Demonstrations, settings: InversionSettings, steps: int, first: Concepts, tell: Tell
 ) -> dict[str, _Shares]:
     """Training and leave-one-out losses of one set for every concept."""
     every = {name: [row for row, text in enumerate(demonstrations.concepts) if text == name] for name in first}
@@ -187,12 +169,7 @@ def _of(demonstrations: Demonstrations, concepts: Collection[str]) -> Demonstrat
 
 
 def _chosen(
-    model: Invertible,
-    demonstrations: Demonstrations,
-    settings: InversionSettings,
-    steps: int,
-    first: Mapping[str, Concept],
-    tell: Tell,
+    model: Invertible, demonstrations: Demonstrations, settings: InversionSettings, steps: int, first: Concepts, tell: Tell
 ) -> dict[str, Concept]:
     """Every concept in its selected form, with its measurements and its embeddings for composition."""
     demonstrated = {name: demonstrations.select(name) for name in first}
@@ -216,7 +193,7 @@ def _chosen(
     if narrow := [name for name in enough if qualities[name][ADAPTED].spread < NARROW]:
         for name, concept in _adapted(model, _of(demonstrations, narrow), settings, steps, True, tell).items():
             forms[name][MIXED], qualities[name][MIXED] = _narrowed(model, demonstrated[name], concept, settings.seed)
-    span: Mapping[str, Concept] = {}
+    span: Concepts = {}
     if composable := [name for name, share in shares.items() if share.composes]:
         span = invert(model, _of(demonstrations, composable), _one_set(settings.from_one_start(), off_span=0.0), steps, tell)
     for name in several:

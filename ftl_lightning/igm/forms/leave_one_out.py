@@ -28,8 +28,6 @@ FAR = 10.0
 """Minimum ratio of the training loss to the loss of generated behaviour for a task far from pretraining."""
 FALLING = 0.05
 """Minimum relative fall of the left-out loss for one more demonstration, for more to be likely to help."""
-
-
 TOGETHER = 4096
 """Maximum number of noised demonstrations in a batch."""
 GENERATED = Sampling("dpm_solver", 10)
@@ -40,14 +38,7 @@ COMPARED = 8
 
 @dataclass(frozen=True)
 class _Noised:
-    """Windows of demonstrations, and noise shared by all demonstrations and concepts.
-
-    Attributes:
-        model, kind: model and kind of the loss.
-        states, seen: windows ``(demo * sample, window, state)``, ordered by demonstration, and their observations.
-        draws: timesteps and noise.
-        demonstrations: number of demonstrations.
-    """
+    """Windows ``(demo * sample, window, state)`` by demonstration, what is ``seen`` there, and noise shared by all concepts."""
 
     model: Invertible
     kind: str
@@ -91,19 +82,14 @@ def relative_losses(
     settings: InversionSettings,
     tell: Callable[[int], None] = lambda count: None,
 ) -> Tensor:
-    """Losses relative to the unconditional loss; below 1 if a concept explains a demonstration.
+    """Losses ``(concept, demo)`` on the CPU, relative to the unconditional loss; below 1 if a concept explains a demonstration.
 
     Noise, timesteps and starts of windows are shared by all demonstrations and concepts.
 
     Args:
-        model: model of the loss.
-        demonstrations: demonstrations that fit the model.
         concepts: ``(concept, K, ...)``, on the model's device.
         settings: kind of loss, timesteps, and samples a step; each demonstration gets twice as many noised samples.
         tell: called with the number of concepts after each batch.
-
-    Returns:
-        ``(concept, demo)`` on the CPU.
     """
     noised = _Noised.of(model, demonstrations, settings, _samples(settings))
     empty = noised.empty(concepts)
@@ -120,13 +106,7 @@ def generated_loss(model: Invertible, demonstrations: Demonstrations, settings: 
     """Loss of generated behaviour, in the units of :func:`relative_losses`: a lower bound of losses.
 
     Behaviour of training concepts is generated from the windows' initial states. A concept learned as well as in pretraining has
-    about this loss.
-
-    Args:
-        model, demonstrations, settings: as in :func:`relative_losses`.
-
-    Returns:
-        Median over at most :data:`COMPARED` training concepts.
+    about this loss. The median over at most :data:`COMPARED` training concepts is returned.
     """
     embeddings = model.training_embeddings[:, None, None]
     chosen = torch.linspace(0, len(embeddings) - 1, min(COMPARED, len(embeddings))).round().long()
@@ -233,12 +213,7 @@ def learned_from(
     """Learn one set of embeddings for each subset, in one batch: ``(subset, K, ...)`` on the model's device.
 
     Args:
-        model: the frozen model.
-        demonstrations: demonstrations of one concept or several.
-        chosen: rows of each subset.
         settings: settings in the paper's form.
-        steps: maximum number of gradient steps.
-        tell: called with the mean loss after each step.
     """
     parts = [replace(demonstrations.rows(list(rows)), concepts=(f"{number}",) * len(rows)) for number, rows in enumerate(chosen)]
     sets = list(invert(model, concatenate(parts), settings, steps, tell).values())
@@ -259,20 +234,13 @@ def quickly(settings: InversionSettings) -> InversionSettings:
 
 
 def leave_one_out(
-    model: Invertible,
-    demonstrations: Demonstrations,
-    settings: InversionSettings,
-    steps: int,
-    tell: Tell = lambda loss: None,
+    model: Invertible, demonstrations: Demonstrations, settings: InversionSettings, steps: int, tell: Tell = lambda loss: None
 ) -> LeaveOneOut:
     """Learn the concept from subsets, in one batch, and measure each on the left-out demonstrations.
 
     Args:
-        model: the frozen model.
         demonstrations: two or more of one concept; the first :data:`MOST` are used.
         settings: settings of the inversion; modes, adapters and restarts are ignored.
-        steps: maximum number of gradient steps.
-        tell: called with the mean loss after each step.
     """
     count = min(len(demonstrations), MOST)
     used, chosen = demonstrations.rows(list(range(count))), subsets(count)

@@ -15,8 +15,8 @@ STRETCH = 1.5
 def even_stretch(modes: int) -> float:
     """Stretch with which mixtures have the variance of the behaviour that the modes were drawn from.
 
-    Mixtures with uniform shares on the simplex have 1 / (modes + 1) of the variance of the modes. The variance of the modes is
-    (modes - 1) / modes of the behaviour's.
+    Mixtures with uniform shares on the simplex have 1 / (modes + 1) of the modes' variance, which is (modes - 1) / modes of the
+    behaviour's.
     """
     return ((modes + 1) * modes / (modes - 1)) ** 0.5 if modes > 1 else 1.0
 
@@ -69,10 +69,6 @@ class Modes(Shown):
         """Draw modes or mixtures: embeddings ``(row, K, knots, n)``, weights ``(row, K)``, and the row of each sample ``(count,)``.
 
         A mixture is ``mean + stretch * sum_m share_m (mode_m - mean)`` with shares uniform on the simplex (Dirichlet(1)).
-
-        Args:
-            count: number of samples.
-            generator: generator of modes or shares.
         """
         if not self.mixed:
             chosen = torch.randint(len(self), (count,), generator=generator, device=generator.device)

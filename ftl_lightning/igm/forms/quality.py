@@ -114,10 +114,7 @@ def measured(model: Invertible, demonstrations: Demonstrations, concepts: Mappin
     """Quality of concepts by name, in the network's normalised inputs, so that columns are comparable.
 
     Args:
-        model: generative model.
         demonstrations: two or more, which also provide the initial states.
-        concepts: concepts by name.
-        seed: seed of the samples.
     """
     known = encoded(model, *first_windows(demonstrations, model.horizon))
     plans, starts = generated(model, demonstrations, concepts, seed)

@@ -1,22 +1,18 @@
 """Goal-conditioned behaviour cloning (paper, 'Baselines' and 'Implementation Details')."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ftl_lightning.domains.comparison import WITH_MODES
 from ftl_lightning.training.method import Form, Method, check_present_or_moment
 
-if TYPE_CHECKING:
-    from ftl_lightning.training.concept_model import ConceptModel
-    from ftl_lightning.training.pretraining import Pretraining
 
-
-def _model() -> "type[ConceptModel]":
+def _model() -> type[Any]:
     from ftl_lightning.methods.bc.model import CloningModel
 
     return CloningModel
 
 
-def _pretraining() -> "type[Pretraining[Any]]":
+def _pretraining() -> type[Any]:
     from ftl_lightning.methods.bc.pretraining import CloningPretraining
 
     return CloningPretraining

@@ -51,11 +51,7 @@ class ParallelMLP(nn.Module):
 
 
 class CloningModel(AdditiveModel, TextConceptModel):
-    """Deterministic policy of the concept and, if observed, the state; composing adds concepts.
-
-    Args:
-        prepared: configuration and domain.
-    """
+    """Deterministic policy of the concept and, if observed, the state; composing adds concepts."""
 
     method = METHOD
     Config = CloningConfig
@@ -73,23 +69,12 @@ class CloningModel(AdditiveModel, TextConceptModel):
         return self.config.window
 
     def predict(self, vector: Tensor | None, concepts: Tensor) -> Tensor:
-        """Predict normalised transitions ``(member, batch, moments, state)``.
-
-        Args:
-            vector: ``(member or 1, batch, m)`` or ``None``.
-            concepts: ``(member or 1, batch, n)``.
-        """
+        """Predict normalised transitions ``(member, batch, moments, state)`` from inputs ``(member or 1, batch, ...)``."""
         out: Tensor = self.network(concepts if vector is None else torch.cat((vector, concepts), dim=-1))
         return out.unflatten(-1, (self.config.moments, self.config.state_dim))
 
     def errors(self, states: Tensor, observed: Observed, concepts: Tensor) -> Tensor:
-        """Squared error of transitions ``(batch,)``, the Gaussian negative log-likelihood up to constants.
-
-        Args:
-            states: ``(batch, window, state)`` in the domain's units.
-            observed: features ``(batch, *shape)`` by name.
-            concepts: ``(batch, n)``.
-        """
+        """Squared error of transitions ``(batch,)``, the Gaussian negative log-likelihood up to constants."""
         vector = self.vector(observed)
         predicted = self.predict(None if vector is None else vector[None], concepts[None])
         target = self.encode(states[:, :: self.config.stride], observed)

@@ -1,22 +1,18 @@
 """Conditional VAE (paper, 'Baselines'): a concept space learned from behaviour alone, without the paired concepts."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ftl_lightning.domains.comparison import WITH_MODES
 from ftl_lightning.training.method import Form, Method
 
-if TYPE_CHECKING:
-    from ftl_lightning.training.concept_model import ConceptModel
-    from ftl_lightning.training.pretraining import Pretraining
 
-
-def _model() -> "type[ConceptModel]":
+def _model() -> type[Any]:
     from ftl_lightning.methods.cvae.model import VAEModel
 
     return VAEModel
 
 
-def _pretraining() -> "type[Pretraining[Any]]":
+def _pretraining() -> type[Any]:
     from ftl_lightning.methods.cvae.pretraining import VAEPretraining
 
     return VAEPretraining

@@ -26,11 +26,7 @@ class VAEConfig(ModelConfig):
 
 
 class VAEModel(AdditiveModel):
-    """VAE of behaviour, conditioned on the initial state. A concept is a value of the latent z; composing adds concepts.
-
-    Args:
-        prepared: configuration and domain.
-    """
+    """VAE of behaviour, conditioned on the initial state. A concept is a value of the latent z; composing adds concepts."""
 
     method = METHOD
     Config = VAEConfig

@@ -1,22 +1,18 @@
 """Our method (the paper's FTL-IGM): a conditional diffusion model whose concepts are learned by gradient descent."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ftl_lightning.domains.comparison import OURS, WITH_ADAPTER, WITH_KNOTS, WITH_MODES
 from ftl_lightning.training.method import Form, Method
 
-if TYPE_CHECKING:
-    from ftl_lightning.training.concept_model import ConceptModel
-    from ftl_lightning.training.pretraining import Pretraining
 
-
-def _model() -> "type[ConceptModel]":
+def _model() -> type[Any]:
     from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 
     return GenerativeModel
 
 
-def _pretraining() -> "type[Pretraining[Any]]":
+def _pretraining() -> type[Any]:
     from ftl_lightning.methods.ftl_igm.pretraining import PretrainingModule
 
     return PretrainingModule

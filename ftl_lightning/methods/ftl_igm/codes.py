@@ -46,7 +46,6 @@ class Codes:
             texts: ``(batch, n)``, unconditional where removed.
             removed: mask of removed texts ``(batch,)``.
             clean: plans ``(batch, horizon, state)``, normalised.
-            draw: random generator.
         """
         count, width, device = *texts.shape, clean.device
         times = torch.linspace(0, clean.shape[1] - 1, self.knots, device=device).round().long()

@@ -45,11 +45,7 @@ class DiffusionConfig(ModelConfig):
 
 
 def build_denoiser(config: DiffusionConfig) -> nn.Module:
-    """Build a denoiser of the configured class and size.
-
-    Raises:
-        UserError: for an unknown class or invalid arguments.
-    """
+    """Build a denoiser of the configured class and size; ``UserError`` for an unknown class or invalid arguments."""
     known, smooth = networks.__all__, config.denoiser_args.get("smooth")
     require(config.denoiser in known, "denoiser", f"one of {', '.join(known)}", repr(short(config.denoiser)))
     require(config.prediction in PREDICTIONS, "prediction", f"one of {', '.join(PREDICTIONS)}", repr(short(config.prediction)))
@@ -72,11 +68,7 @@ def build_denoiser(config: DiffusionConfig) -> nn.Module:
 
 
 class GenerativeModel(DiffusionModel, TextConceptModel):
-    """Conditional diffusion model of plans.
-
-    Args:
-        prepared: configuration, domain and text embeddings.
-    """
+    """Conditional diffusion model of plans."""
 
     method = METHOD
     invertible = True

@@ -148,11 +148,6 @@ class PretrainingModule(Pretraining[GenerativeModel]):
             t = timesteps(drawn(count, lambda n: torch.rand(n, generator=draw, device=self.device)), total, power)
         noise = drawn(count, lambda n: torch.randn((n, *clean.shape[1:]), generator=draw, device=self.device))
         losses = denoising_loss(
-            lambda x, t: model.denoiser(x, t, concepts, index, context),
-            clean,
-            noise,
-            t,
-            model.alpha_bar,
-            self.loss.discount,
+            lambda x, t: model.denoiser(x, t, concepts, index, context), clean, noise, t, model.alpha_bar, self.loss.discount
         )
         return losses * loss_weights(self.loss.kind, model.alpha_bar)[t]

@@ -50,9 +50,6 @@ class InContextModel(ConceptModel):
     The encoder reads transitions, with a zero vector between demonstrations. The decoder reads the current observation (the paper's
     window of 1) and predicts probabilities of bins over [-1, 1] for each value of the next state.
 
-    Args:
-        prepared: configuration and domain.
-
     Raises:
         UserError: for a width that is not a multiple of the heads.
     """
@@ -87,14 +84,11 @@ class InContextModel(ConceptModel):
         return self.config.window
 
     def prompts(self, demonstrations: Demonstrations, perturbed: bool = False) -> Tensor:
-        """Encode demonstrations as prompts ``(demo, n)``.
+        """Encode demonstrations as prompts ``(demo, n)``; ``UserError`` if features are observed only at the first time.
 
         Args:
             demonstrations: demonstrations with features observed at every time.
             perturbed: apply the view's perturbation, if configured.
-
-        Raises:
-            UserError: if features are observed only at the first time.
         """
         if not demonstrations.per_step or not set(self.domain.observed) <= set(demonstrations.per_step):
             raise UserError("key 'per_step': expected every feature to be observed at each time, found others")
@@ -110,13 +104,8 @@ class InContextModel(ConceptModel):
         return read.unflatten(0, (-1, tokens)).flatten(1).cpu()
 
     def present_vector(self, observed: Observed) -> Tensor:
-        """Normalised observation ``(batch, m)``, see :meth:`vector`.
-
-        Raises:
-            UserError: for a domain without observed features.
-        """
-        vector = self.vector(observed)
-        if vector is None:
+        """Normalised observation ``(batch, m)``, see :meth:`vector`; ``UserError`` for a domain without observed features."""
+        if (vector := self.vector(observed)) is None:
             raise UserError(
                 f"domain: expected one with observed features, found {self.domain.name}: there is no present to go on from"
             )
@@ -142,11 +131,7 @@ class InContextModel(ConceptModel):
         return ((normalised + 1) / 2 * self.config.bins).long().clamp(0, self.config.bins - 1)
 
     def read_concepts(self, demonstrations: Demonstrations) -> dict[str, Concept]:
-        """Encode demonstrations as concepts.
-
-        Raises:
-            UserError: for features observed only at the first time.
-        """
+        """Encode demonstrations as concepts; ``UserError`` for features observed only at the first time."""
         concepts = {}
         for name in dict.fromkeys(demonstrations.concepts):
             prompts = self.prompts(demonstrations.select(name))

@@ -101,11 +101,7 @@ class InContextPretraining(Pretraining[InContextModel]):
 
 
 def take_images(encoders: nn.Module, weights: Mapping[str, Tensor], folder: str) -> None:
-    """Load image encoders from a trained model and freeze the weights.
-
-    Raises:
-        UserError: for a model that observes other images.
-    """
+    """Load image encoders from a trained model and freeze the weights; ``UserError`` for a model that observes other images."""
     try:
         encoders.load_state_dict(weights)
     except RuntimeError as error:
