@@ -17,8 +17,7 @@ from scipy.spatial.transform import Rotation
 from ftl_lightning.services.errors import UserError, require
 from ftl_lightning.services.files import most_bytes, read_text
 
-INCH = 0.0254
-"""Metres. Lengths in the database are inches after division by ``length`` in the skeleton's ``units``."""
+INCH = 0.0254  # Metres. Lengths in the database are inches after division by length in the skeleton's units.
 ROOT = "root"
 JOINT_BONES = (
     "rhipjoint", "rfemur", "rtibia", "lhipjoint", "lfemur", "ltibia", "rclavicle", "rhumerus", "rradius", "lclavicle", "lhumerus",
@@ -26,8 +25,7 @@ JOINT_BONES = (
 )  # fmt: skip
 """Bones whose ends are the joints, in their order."""
 THORAX = "thorax"
-_NUMBERS = {"direction": 3, "length": 1, "axis": 3}
-"""Count of numbers per key of a bone."""
+_NUMBERS = {"direction": 3, "length": 1, "axis": 3}  # Count of numbers per key of a bone
 _CHANNELS = ("TX", "TY", "TZ", "RX", "RY", "RZ")
 
 

@@ -20,8 +20,7 @@ from ftl_lightning.services.errors import UserError, require, short
 from ftl_lightning.services.files import read_text
 
 Numbers = NDArray[np.float64]
-END = "EndSite"
-"""Prefix of the name of an end site, before its joint's name."""
+END = "EndSite"  # Prefix of the name of an end site, before its joint's name
 _POSITIONS = {f"{axis}position": number for number, axis in enumerate("XYZ")}
 _ROTATIONS = {f"{axis}rotation": number for number, axis in enumerate("XYZ")}
 
@@ -160,8 +159,7 @@ def _nodes(words: Iterator[str]) -> Iterable[Node]:
     return nodes
 
 
-METRES = INCH / 0.45
-"""Metres per unit of the conversion, which is that of the ASF files."""
+METRES = INCH / 0.45  # Metres per unit of the conversion, which is that of the ASF files
 NODES = (
     "RightUpLeg", "RightLeg", "RightFoot", "LeftUpLeg", "LeftLeg", "LeftFoot", "RightArm", "RightForeArm", "RightHand", "LeftArm",
     "LeftForeArm", "LeftHand", "Neck1", "EndSiteHead",
@@ -201,12 +199,9 @@ def converted(motion: Motion, skeleton: Skeleton | None) -> NDArray[np.float64]:
     return motion.places(NODES, put_back)[1:] * METRES
 
 
-HIPS = len(skeleton.JOINTS)
-"""Index of the middle of the hips, after those of the joints."""
-TIP = 0.08
-"""Length in metres of the head's visible bone."""
-SHORTEST = 1e-6
-"""Minimum length in metres of a bone with a direction; shorter bones do not rotate."""
+HIPS = len(skeleton.JOINTS)  # Index of the middle of the hips, after those of the joints
+TIP = 0.08  # Length in metres of the head's visible bone
+SHORTEST = 1e-6  # Minimum length in metres of a bone with a direction; shorter bones do not rotate
 
 
 class Joint(NamedTuple):

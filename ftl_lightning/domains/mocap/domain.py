@@ -30,8 +30,7 @@ from ftl_lightning.domains.pictures import Show
 from ftl_lightning.domains.tasks import training_suite
 from ftl_lightning.services.randomness import drawn
 
-SHORTEST = 1e-3
-"""Minimum length in metres of a generated bone with a direction; shorter bones are not changed."""
+SHORTEST = 1e-3  # Minimum length in metres of a generated bone with a direction; shorter bones are not changed
 
 
 def with_rigid_bones(states: Tensor, observed: Observed) -> Tensor:
@@ -69,10 +68,8 @@ def smoothed(states: Tensor, observed: Observed) -> Tensor:
     return with_rigid_bones(states, observed)
 
 
-SHARE = 0.5
-"""Share of windows with another initial pose."""
-BLENDED = (8, 12)
-"""Minimum and maximum frames of the transition to the recorded window."""
+SHARE = 0.5  # Share of windows with another initial pose
+BLENDED = (8, 12)  # Minimum and maximum frames of the transition to the recorded window
 
 
 def begun_elsewhere(states: Tensor, observed: Observed, draw: torch.Generator | None) -> tuple[Tensor, Observed]:

@@ -16,8 +16,7 @@ from ftl_lightning.domains.mocap.skeleton import FPS, HEAD, NECK, as_joints
 RH, RK, RA, LH, LK, LA, RS, RE, RW, LS, LE, LW = range(12)
 """Joints of the right and the left side: hip, knee, ankle, shoulder, elbow, wrist."""
 JOINTS = len(skeleton.JOINTS)
-LOWER, UPPER = (RH, RK, RA, LH, LK, LA), (RS, RE, RW, LS, LE, LW, NECK, HEAD)
-"""Joints of the legs, and of arms and trunk."""
+LOWER, UPPER = (RH, RK, RA, LH, LK, LA), (RS, RE, RW, LS, LE, LW, NECK, HEAD)  # Joints of the legs, and of arms and trunk
 PARENT = {RK: RH, RA: RK, LK: LH, LA: LK, HEAD: NECK, RS: NECK, LS: NECK, RE: RS, LE: LS, RW: RE, LW: LE}
 """Parent of each joint, from the hips outwards; parent of hips and neck is the origin, the middle of the hips."""
 _FREQUENCIES = 6

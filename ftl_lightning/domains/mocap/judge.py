@@ -23,8 +23,7 @@ from ftl_lightning.services.shipped import shipped
 from ftl_lightning.services.tensor_file import file_hash, load_tensors, save_tensors
 
 KIND = "motion judge"
-PATH = Path("pretrained/mocap/judge.safetensors")
-"""File of the shipped judge."""
+PATH = Path("pretrained/mocap/judge.safetensors")  # File of the shipped judge
 WHOLE, ARMS, LEGS = "whole", "arms", "legs"
 PARTS: Mapping[str, tuple[tuple[int, ...], tuple[str, ...]]] = {
     WHOLE: ((*LOWER, *UPPER), CLASSES),
@@ -32,18 +31,12 @@ PARTS: Mapping[str, tuple[tuple[int, ...], tuple[str, ...]]] = {
     LEGS: (LOWER, LEG_CLASSES),
 }
 """Joints and classes of each part of the judge; the trunk belongs to the arms."""
-NUMBERS = {"summary": summary, "extremes": extremes}
-"""Features of linear classifiers by name."""
-VERIFIED_BY = {**NUMBERS, "turns": turns}
-"""Features of verifiers by name."""
-VERIFIER = 32
-"""Hidden units of a verifier."""
-WIDTH, EMBEDDING = 40, 32
-"""Channels and embedding size of a network."""
-STILL = 0.3
-"""Speed in metres per second. If every joint is slower over a sixth of a second, there is no action."""
-RESTING = ("pose", STAND, OTHER)
-"""Classes of windows without movement."""
+NUMBERS = {"summary": summary, "extremes": extremes}  # Features of linear classifiers by name
+VERIFIED_BY = {**NUMBERS, "turns": turns}  # Features of verifiers by name
+VERIFIER = 32  # Hidden units of a verifier
+WIDTH, EMBEDDING = 40, 32  # Channels and embedding size of a network
+STILL = 0.3  # Speed in metres per second. If every joint is slower over a sixth of a second, there is no action.
+RESTING = ("pose", STAND, OTHER)  # Classes of windows without movement
 CONFIRMED = -3.0
 """Minimum mean verifier logit of a confirmed action: probability .05 of the whole action. It is far below one half, as new people
 perform actions a little differently from the training set. Hard negatives have lower logits."""
@@ -54,8 +47,7 @@ Circles need more: they were recorded in all sizes, and a third of a large circl
 unlisted actions, verifiers reject too many new people.
 """
 _SIXTH = FPS // 6
-_OUTLIER = 5.0
-"""Standard deviations at which features are clipped."""
+_OUTLIER = 5.0  # Standard deviations at which features are clipped
 
 
 class Network(nn.Module):

@@ -36,30 +36,20 @@ from ftl_lightning.domains.mocap.skeleton import (
 from ftl_lightning.services.errors import require
 from ftl_lightning.services.shipped import check_extra
 
-STRIDE = 0.3
-"""Minimum ankle distance in metres of a stride; closer ankles are a level pose."""
-SETTLED = 12
-"""First frame that is independent of the initial pose; synchrony and arm paths are judged from here."""
+STRIDE = 0.3  # Minimum ankle distance in metres of a stride; closer ankles are a level pose
+SETTLED = 12  # First frame that is independent of the initial pose; synchrony and arm paths are judged from here
 OVERHEAD = -0.12
 """Jumping jacks: minimum height in metres of both wrists at once above the top of the head; bent arms stay a little below it."""
-OPENED, OPEN = 0.2, 0.4
-"""Jumping jacks: minimum range and minimum peak of the sideways distance of the feet, in metres."""
-HANGING = 0.15
-"""Jumping jacks: minimum depth in metres of the hands below the shoulders at some time."""
-IN_TIME = 0.6
-"""Minimum absolute correlation of hand height and foot distance that counts as synchronous, in phase or in antiphase."""
-TURN = 240.0
-"""Minimum rotation of the arms in degrees in an arm circle, as a mean; two thirds for each arm."""
-WIDTH, ROUND = 0.12, 0.2
-"""Minimum width of the wrists' path, in metres and relative to its length, of a round path."""
+OPENED, OPEN = 0.2, 0.4  # Jumping jacks: minimum range and minimum peak of the sideways distance of the feet, in metres
+HANGING = 0.15  # Jumping jacks: minimum depth in metres of the hands below the shoulders at some time
+IN_TIME = 0.6  # Minimum absolute correlation of hand height and foot distance that counts as synchronous, in phase or in antiphase
+TURN = 240.0  # Minimum rotation of the arms in degrees in an arm circle, as a mean; two thirds for each arm
+WIDTH, ROUND = 0.12, 0.2  # Minimum width of the wrists' path, in metres and relative to its length, of a round path
 RAISED, LOWERED = 0.15, 0.3
 """Knee raise, in metres below the hips: maximum of a raised knee; minimum of this knee at another time, and of the other knee."""
-BENT, STRETCHED = 70.0, 30.0
-"""Squat, in degrees: minimum flexion of both knees at once, and minimum range of this flexion."""
-TREMBLING = 900.0
-"""Maximum jerk of an action in metres per second cubed: the 99th percentile of recorded windows."""
-UPRIGHT, ON_FEET = 0.35, 0.5
-"""Minimum distances in metres from the hips up to the neck, and down to each ankle, of an upright pose."""
+BENT, STRETCHED = 70.0, 30.0  # Squat, in degrees: minimum flexion of both knees at once, and minimum range of this flexion
+TREMBLING = 900.0  # Maximum jerk of an action in metres per second cubed: the 99th percentile of recorded windows
+UPRIGHT, ON_FEET = 0.35, 0.5  # Minimum distances in metres from the hips up to the neck, and down to each ankle, of an upright pose
 
 
 def is_stride(poses: Tensor) -> Tensor:
@@ -183,8 +173,7 @@ RULES: Mapping[str, Callable[[Tensor], Tensor]] = {
 """Rules of actions by goal, from windows ``(sample, frame, 42)`` to ``(sample,)`` of bool."""
 
 
-ENOUGH = 500
-"""Windows per side above which distances of distributions depend more on motion than on the number of windows."""
+ENOUGH = 500  # Windows per side above which distances of distributions depend more on motion than on the number of windows
 _RIGID = [BONES.index(bone) for bone in RIGID]
 
 

@@ -38,23 +38,17 @@ from ftl_lightning.services.tensor_file import write_text
 from ftl_lightning.services.text import counted
 
 REPORT = "recordings.json"
-LEFT_OUT = "left out of pretraining"
-"""Key of the report: trials that are kept, but excluded from pretraining."""
+LEFT_OUT = "left out of pretraining"  # Key of the report: trials that are kept, but excluded from pretraining
 INDEXES = ("cmu-mocap-index.csv", "cmu-mocap-index-text.txt")
 """Names of B. Hahne's index of descriptions, as a spreadsheet or as text; the first existing file is read."""
 SLOW = ("60", "61", "75", "87", "88", "89")
 """Subjects recorded at 60 frames per second, others at 120 (jutanke/mocap); AMC files do not state it."""
-MIN_RAW_FRAMES = 128
-"""Minimum frames of a trial before subsampling."""
-MAX_SPREAD = 1e-3
-"""Maximum range in metres of the length of a bone within a trial."""
-FLOOR = 0.05
-"""Metres: initial frames with lower hips have no root yet."""
+MIN_RAW_FRAMES = 128  # Minimum frames of a trial before subsampling
+MAX_SPREAD = 1e-3  # Maximum range in metres of the length of a bone within a trial
+FLOOR = 0.05  # Metres: initial frames with lower hips have no root yet
 _TRIAL = re.compile(r"(\d{2,3}_\d{2,3})(?!\d)")
-EXAMPLES = 3
-"""Maximum examples printed per reason; the report has all."""
-SAME_RATE = 0.01
-"""Relative difference of frame rates that is rounding."""
+EXAMPLES = 3  # Maximum examples printed per reason; the report has all
+SAME_RATE = 0.01  # Relative difference of frame rates that is rounding
 
 
 _skeleton = functools.cache(read_asf)

@@ -17,14 +17,10 @@ from ftl_lightning.services.text import figure_text
 
 LEFT, RIGHT, TRUNK = "#0a6fb5", "#d9591c", "#3b3f45"
 """Colours of the person's left and right limbs and of the trunk; safe for colour blindness."""
-MAX_SAMPLES, POSES = 8, 8
-"""Maximum rows of a figure, and poses per row."""
-STEP = 1.4
-"""Distance in metres between poses; arms may reach into the next pose."""
-SOLE = 0.08
-"""Metres from an ankle down to the floor."""
-HEAD = 0.11
-"""Radius of the drawn head in metres."""
+MAX_SAMPLES, POSES = 8, 8  # Maximum rows of a figure, and poses per row
+STEP = 1.4  # Distance in metres between poses; arms may reach into the next pose
+SOLE = 0.08  # Metres from an ankle down to the floor
+HEAD = 0.11  # Radius of the drawn head in metres
 
 
 def _colour(a: int, b: int) -> str:
@@ -33,8 +29,7 @@ def _colour(a: int, b: int) -> str:
     return RIGHT if a in skeleton.RIGHT else LEFT
 
 
-COLOURS = tuple(_colour(a, b) for a, b in BONES)
-"""Colours of the bones."""
+COLOURS = tuple(_colour(a, b) for a, b in BONES)  # Colours of the bones
 
 
 def wireframe(states: Tensor) -> Wireframe:

@@ -20,21 +20,16 @@ JOINTS = (
     "RHip", "RKnee", "RAnkle", "LHip", "LKnee", "LAnkle", "RShoulder", "RElbow", "RWrist", "LShoulder", "LElbow", "LWrist", "Neck",
     "HeadTop",
 )  # fmt: skip
-COLUMNS = tuple(f"{joint}.{axis}" for joint in JOINTS for axis in "xyz")
-"""Columns of a state, in metres."""
+COLUMNS = tuple(f"{joint}.{axis}" for joint in JOINTS for axis in "xyz")  # Columns of a state, in metres
 NAME = "mocap"
-POSE = "pose"
-"""Observed feature: the joints at the start of a plan, which are the plan's first state."""
+POSE = "pose"  # Observed feature: the joints at the start of a plan, which are the plan's first state
 OBSERVED = {POSE: Feature((len(COLUMNS),), state=tuple(range(len(COLUMNS))))}
-FPS = 30
-"""Frames per second."""
-HORIZON = 32
-"""Frames in a plan."""
+FPS = 30  # Frames per second
+HORIZON = 32  # Frames in a plan
 
 R_HIP, R_KNEE, R_ANKLE, L_HIP, L_KNEE, L_ANKLE, R_SHOULDER, R_ELBOW, R_WRIST, L_SHOULDER, L_ELBOW, L_WRIST, NECK, HEAD = range(14)
 RIGHT = (R_HIP, R_KNEE, R_ANKLE, R_SHOULDER, R_ELBOW, R_WRIST)
-LEFT = (L_HIP, L_KNEE, L_ANKLE, L_SHOULDER, L_ELBOW, L_WRIST)
-"""Joints of the left side, in the order of the right."""
+LEFT = (L_HIP, L_KNEE, L_ANKLE, L_SHOULDER, L_ELBOW, L_WRIST)  # Joints of the left side, in the order of the right
 MIDDLE = (NECK, HEAD)
 HIPS, SHOULDERS, WRISTS = (R_HIP, L_HIP), (R_SHOULDER, L_SHOULDER), (R_WRIST, L_WRIST)
 KNEES, ANKLES, ELBOWS = (R_KNEE, L_KNEE), (R_ANKLE, L_ANKLE), (R_ELBOW, L_ELBOW)
@@ -48,8 +43,7 @@ BONES = (
 RIGID = ((0, 1), (1, 2), (0, 3), (3, 4), (4, 5), (6, 7), (7, 8), (9, 10), (10, 11))
 """Lines of :data:`BONES` that are single bones of the skeleton, of constant length."""
 
-MIRROR = (3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8, 12, 13)
-"""Source of each joint in the mirror image."""
+MIRROR = (3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8, 12, 13)  # Source of each joint in the mirror image
 
 
 def _columns(*joints: int) -> tuple[int, ...]:
@@ -128,12 +122,9 @@ _RIGHT_SIDE = (
 )
 """Hip, knee, ankle, shoulder, elbow, wrist in metres, of an adult of medium size."""
 _MIDDLE = ((0.0, 0.02, 0.55), (0.0, 0.07, 0.73))
-STRIDE = 0.4
-"""Maximum angle in radians of a leg forwards or back."""
-SWING = 0.8
-"""Swing of the arm relative to the leg of the same side, in the opposite direction."""
-BEND = 0.15
-"""Radians by which thighs point further forwards, and shanks further back."""
+STRIDE = 0.4  # Maximum angle in radians of a leg forwards or back
+SWING = 0.8  # Swing of the arm relative to the leg of the same side, in the opposite direction
+BEND = 0.15  # Radians by which thighs point further forwards, and shanks further back
 
 BEGINNINGS = "distribution of poses"
 _FILE = Path(__file__).parent / "beginnings.safetensors"

@@ -162,16 +162,11 @@ def read_folder(root: Path | None) -> tuple[Recordings, tuple[Segment, ...]]:
 
 MAX_SPEED = 12.0
 """Maximum joint speed in metres per second. Faster frames are glitches, or hips without defined yaw; trials are cut there."""
-LONGEST = 128
-"""Maximum frames of a piece; parts of longer pieces overlap by a window less a frame, so that no window is lost."""
-OTHER_FIGURES = ("bvh_daz",)
-"""Excluded kinds of recordings: all subjects retargeted to the same figure."""
-CYCLE = 8
-"""Frames; periodic motion has at least twice as many per period."""
-ARMS_DOWN = 0.4
-"""Maximum distance in metres from wrist to hip, sideways and vertical, of hanging arms."""
-UPRIGHT = 0.35
-"""Minimum height in metres of shoulders above hips; half the minimum height of hips above ankles."""
+LONGEST = 128  # Maximum frames of a piece; parts of longer pieces overlap by a window less a frame, so that no window is lost
+OTHER_FIGURES = ("bvh_daz",)  # Excluded kinds of recordings: all subjects retargeted to the same figure
+CYCLE = 8  # Frames; periodic motion has at least twice as many per period
+ARMS_DOWN = 0.4  # Maximum distance in metres from wrist to hip, sideways and vertical, of hanging arms
+UPRIGHT = 0.35  # Minimum height in metres of shoulders above hips; half the minimum height of hips above ankles
 
 
 def moving(motions: Sequence[Tensor], concepts: Sequence[str], provenance: Mapping[str, object]) -> Demonstrations:

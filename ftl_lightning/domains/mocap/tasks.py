@@ -16,8 +16,7 @@ from ftl_lightning.services.files import read_text
 
 HELD_OUT = ("13_29", "13_30", "13_31", "14_14", "14_20", "79_01", "80_71", "126_03", "126_04", "126_05")
 """Trials excluded from pretraining as a whole, since they show a new concept."""
-DEMONSTRATORS = ("13", "79", "80", "126")
-"""Subjects who demonstrate new concepts, excluded from the training of the judge."""
+DEMONSTRATORS = ("13", "79", "80", "126")  # Subjects who demonstrate new concepts, excluded from the training of the judge
 with (Path(__file__).parent / "actions.csv").open(encoding="utf-8", newline="") as _file:
     ACTION_OF: Mapping[str, str | None] = {row["description"]: row["action"] or None for row in csv.DictReader(_file)}
 """Training concepts and their actions; ``None`` for other actions, or several in sequence.
@@ -25,17 +24,13 @@ with (Path(__file__).parent / "actions.csv").open(encoding="utf-8", newline="") 
 Dances are separate actions: each kind was danced by a single subject.
 """
 TRAINING_CONCEPTS = tuple(ACTION_OF)
-PAPER_CONCEPTS = ("jumping jacks",)
-"""New concepts of the paper in most copies of the database."""
-STAND_INS = ("arm circle",)
-"""Replacements of the paper's two other new concepts."""
-DATABASE_CONCEPTS = ("chop wood", "breaststroke")
-"""New concepts of the paper in few copies of the database."""
+PAPER_CONCEPTS = ("jumping jacks",)  # New concepts of the paper in most copies of the database
+STAND_INS = ("arm circle",)  # Replacements of the paper's two other new concepts
+DATABASE_CONCEPTS = ("chop wood", "breaststroke")  # New concepts of the paper in few copies of the database
 TEST_CONCEPTS = (*PAPER_CONCEPTS, *STAND_INS)
 VALIDATION_CONCEPTS = ("knee raise", "squat")
 NEW_CONCEPTS = (*TEST_CONCEPTS, *VALIDATION_CONCEPTS, *DATABASE_CONCEPTS)
-AND = " + "
-"""Separator of the concepts of a goal."""
+AND = " + "  # Separator of the concepts of a goal
 COMPOSED_WITH = ("walk", "jump")
 _RENAMED = {"zombiewalk": "zombie walk", "heiansyodan": "heian shodan"}
 _SIDES = {"left": "right", "right": "left"}
@@ -106,15 +101,13 @@ SUITES = {
 methods that cannot compose by parts of the body."""
 
 
-OTHER = "other"
-"""No action: motions of a single person, standing people, and windows without motion (a frozen frame, trembling)."""
+OTHER = "other"  # No action: motions of a single person, standing people, and windows without motion (a frozen frame, trembling)
 
 _NAMES = (
     "walk", "run", "jump", "kick", "punch", "signals", "jumping jacks", "twist", "knee raise", "arm circle", "squat", "toe touch",
     "ballet", "basketball", "cartwheel", "charleston", "climb", "lambada", "pose", "swordplay",
 )  # fmt: skip
-CLASSES = (*_NAMES, OTHER)
-"""Classes of a judge."""
+CLASSES = (*_NAMES, OTHER)  # Classes of a judge
 
 TESTED = CLASSES[: CLASSES.index("toe touch") + 1]
 """Classes of two subjects or more, on which a judge can be tested with new people."""
@@ -123,16 +116,12 @@ _LABELS = {"jog": "run", "leg kick": "kick", "toe touch one hand": "toe touch", 
 """Labels of segments that are no training concepts."""
 _CLASS_OF = {name: name for name in _NAMES} | _LABELS | {text: name for text, name in ACTION_OF.items() if name is not None}
 
-STAND = "stand"
-"""Class of the legs in actions of arms and trunk."""
-STANDING = ("punch", "signals", "twist", "arm circle", "toe touch", "swordplay")
-"""Actions of arms and trunk."""
-STEPPING = ("walk", "run", "kick", "knee raise", "squat", "basketball")
-"""Actions of the legs, independent of the arms."""
+STAND = "stand"  # Class of the legs in actions of arms and trunk
+STANDING = ("punch", "signals", "twist", "arm circle", "toe touch", "swordplay")  # Actions of arms and trunk
+STEPPING = ("walk", "run", "kick", "knee raise", "squat", "basketball")  # Actions of the legs, independent of the arms
 REVERSIBLE = ("jumping jacks", "twist", "knee raise", "arm circle", "squat", "toe touch")
 """Periodic actions, invariant to time reversal."""
-LEG_CLASSES = (*(name for name in CLASSES if name not in STANDING), STAND)
-"""Classes of a judge of the legs."""
+LEG_CLASSES = (*(name for name in CLASSES if name not in STANDING), STAND)  # Classes of a judge of the legs
 
 
 def action(text: str) -> str | None:

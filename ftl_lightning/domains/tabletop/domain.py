@@ -50,10 +50,8 @@ if TYPE_CHECKING:
     from ftl_lightning.domains.tabletop.source import Expert
 
 _LOG = logging.getLogger(__name__)
-BOOK_MOVED = 0.02
-"""Displacement in metres above which the book counts as moved."""
-HORIZON = 32
-"""States per plan, as in the paper."""
+BOOK_MOVED = 0.02  # Displacement in metres above which the book counts as moved
+HORIZON = 32  # States per plan, as in the paper
 RENDERING = "ftl_lightning.domains.tabletop.rendering"
 
 

@@ -47,25 +47,18 @@ from ftl_lightning.domains.tabletop.scenes import (
 from ftl_lightning.domains.tabletop.world import ARM, FASTEST, FINGERS, REST, TIP, Bodies, build, downward, turned
 from ftl_lightning.services.errors import UserError, require
 
-TARGETS, SUBSTEPS = 3, 8
-"""Arm targets per step, and simulation steps per target."""
-ITERATIONS = 20
-"""Maximum iterations of inverse kinematics per target."""
+TARGETS, SUBSTEPS = 3, 8  # Arm targets per step, and simulation steps per target
+ITERATIONS = 20  # Maximum iterations of inverse kinematics per target
 GAIN = 0.1
-FORCE = 20.0
-"""Force of a finger in newtons."""
-REACH = ((0.25, 0.78), (-0.36, 0.36), (0.008, 0.4))
-"""Ranges of the hand position in metres."""
-TOUCH = 0.003
-"""Maximum gap in metres between circle and triangle that counts as contact."""
+FORCE = 20.0  # Force of a finger in newtons
+REACH = ((0.25, 0.78), (-0.36, 0.36), (0.008, 0.4))  # Ranges of the hand position in metres
+TOUCH = 0.003  # Maximum gap in metres between circle and triangle that counts as contact
 LIFTED, AWAY, STILL = 0.02, 0.05, 0.001
 """Thresholds in metres: rise of a lifted circle; height of the open hand above a released circle, and the circle's maximum movement
 per step."""
-RECYCLE = 200
-"""Scenes after which the simulator is restarted, since it leaks memory."""
+RECYCLE = 200  # Scenes after which the simulator is restarted, since it leaks memory
 
-Seen = dict[str, NDArray[Any]]
-"""Observed features by name."""
+Seen = dict[str, NDArray[Any]]  # Observed features by name
 
 
 class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
@@ -291,10 +284,8 @@ def touching(shape: NDArray[np.float64], circle: NDArray[np.float64]) -> bool:
     return gap(outline(CIRCLE, float(circle[0]), float(circle[1]), 0.0), shape) <= TOUCH
 
 
-LEVEL = 0.008
-"""Tolerance in metres of the circle's height on a surface."""
-NEAR = 0.15
-"""Maximum centre distance in metres between the circle and the object beside it."""
+LEVEL = 0.008  # Tolerance in metres of the circle's height on a surface
+NEAR = 0.15  # Maximum centre distance in metres between the circle and the object beside it
 
 
 def judged(task: str, scene: NDArray[np.float32], info: Mapping[str, Any]) -> bool:

@@ -42,24 +42,18 @@ if TYPE_CHECKING:
 
 Place = NDArray[np.float64]
 
-WIDEST = 0.8
-"""Maximum angle in radians of a pushing hand from the line behind the circle, seen from the circle."""
-FARTHEST = 0.12
-"""Maximum distance in metres of a pushing hand from the circle's centre."""
+WIDEST = 0.8  # Maximum angle in radians of a pushing hand from the line behind the circle, seen from the circle
+FARTHEST = 0.12  # Maximum distance in metres of a pushing hand from the circle's centre
 STEERING = 3.0
 """Steering gain: deviation of the hand's direction from the circle's, per radian of the hand's angle. 1 moves straight to the
 circle's centre, larger values return to the line behind it."""
-LOW = 0.006
-"""Height in metres above push height below which a hand is low."""
-CLEAR = 0.065
-"""Travel height in metres above push height, above all objects."""
+LOW = 0.006  # Height in metres above push height below which a hand is low
+CLEAR = 0.065  # Travel height in metres above push height, above all objects
 NEAR, FUNNEL = 0.015, 0.03
 """Distances in metres from the point of descent: radius in which the hand may be low, and width of the funnel above it. The radius
 exceeds the spread of this point between demonstrations; otherwise their mean would stay in the air."""
-ACROSS, DOWN, UP = 0.016, 0.011, 0.014
-"""Maximum metres per step sideways, down and up."""
-AHEAD = 0.05
-"""Distance in metres of the circle's next goal on the path around the bowl."""
+ACROSS, DOWN, UP = 0.016, 0.011, 0.014  # Maximum metres per step sideways, down and up
+AHEAD = 0.05  # Distance in metres of the circle's next goal on the path around the bowl
 
 
 @dataclass(frozen=True)
@@ -143,45 +137,32 @@ def _tangent(centre: Place, place: Place, turn: float) -> float:
     return math.atan2(off[1], off[0]) - turn * math.acos(RING / distance)
 
 
-PAST = 8
-"""Steps that a push continues after success: small position errors must not stop a policy before the triangle."""
-STAY = 4
-"""Steps of rest after a task, so that plans end at rest."""
+PAST = 8  # Steps that a push continues after success: small position errors must not stop a policy before the triangle
+STAY = 4  # Steps of rest after a task, so that plans end at rest
 CLOSED = 0.0
-PUSH_HEIGHT = 0.014
-"""Hand height in metres above the surface under the circle during a push."""
+PUSH_HEIGHT = 0.014  # Hand height in metres above the surface under the circle during a push
 GRASP_HEIGHT = 0.016
-ASIDE = 0.006
-"""Maximum lateral offset in metres at the start of a push."""
-SPEED = 0.008
-"""Push speed in metres per step."""
-SLOWER = 1.4
-"""Speed divisor of pushes on the book, which adds time steps to learn from."""
+ASIDE = 0.006  # Maximum lateral offset in metres at the start of a push
+SPEED = 0.008  # Push speed in metres per step
+SLOWER = 1.4  # Speed divisor of pushes on the book, which adds time steps to learn from
 STRAIGHT_SPEED = 0.009
-TREMBLE = 0.0003
-"""Standard deviation of the hand noise per step, in metres."""
+TREMBLE = 0.0003  # Standard deviation of the hand noise per step, in metres
 SLIPS, SLIP = 0.04, (0.006, 0.018)
 """Slip probability per step of a push, and range of slip sizes in metres. Recovery is learned only from demonstrations that leave
 the path (Laskey et al., 2017); constant noise would hide the path."""
-RETURN = 0.8
-"""Share of the hand's deviation from its path that remains a step later."""
-MISLAID = 0.6
-"""Recoveries: probability that the circle is moved."""
+RETURN = 0.8  # Share of the hand's deviation from its path that remains a step later
+MISLAID = 0.6  # Recoveries: probability that the circle is moved
 LYING, RISING, OVER = 0.5, 0.4, 0.03
 """Recoveries: probability of a low hand; probability that any other hand is beside the circle; minimum height in metres above push
 height of a hand over the circle."""
-ASTRAY, REACHED = ((0.32, 0.70), (-0.28, 0.28)), ((0.26, 0.77), (-0.35, 0.35))
-"""Recoveries: x and y ranges of circle and hand."""
-OPENED, HIGHEST = 0.5, 0.16
-"""Recoveries of picks: probability of an open hand, and maximum hand height in metres above push height."""
+ASTRAY, REACHED = ((0.32, 0.70), (-0.28, 0.28)), ((0.26, 0.77), (-0.35, 0.35))  # Recoveries: x and y ranges of circle and hand
+OPENED, HIGHEST = 0.5, 0.16  # Recoveries of picks: probability of an open hand, and maximum hand height in metres above push height
 AROUND, ROOM, FARTHEST_PUSH = (0.034, 0.08), 0.012, 0.33
 """Recoveries, in metres: range of the distance between hand and circle; minimum gap between the circle and other objects; maximum
 distance between the circle and the target of a push."""
-APART_FROM = 0.12
-"""Centre distance in metres between an object and the circle placed beside it; leaves room for open fingers."""
+APART_FROM = 0.12  # Centre distance in metres between an object and the circle placed beside it; leaves room for open fingers
 
-Moves = Generator[Place, None, None]
-"""Commands ``(4,)`` per step: x, y, z and gripper opening."""
+Moves = Generator[Place, None, None]  # Commands (4,) per step: x, y, z and gripper opening
 
 
 @dataclass(frozen=True)

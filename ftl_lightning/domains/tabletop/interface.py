@@ -59,10 +59,8 @@ class Camera:
         return (np.array([1, 1]) + seen * (1, -1)) / 2 * (self.size[1], self.size[0])
 
 
-OVERHEAD = Camera((0.5, 0.0, 0.85), (0.5, 0.0, 0.0), (1.0, 0.0, 0.0), 45.0, (64, 64))
-"""Camera of the model."""
-FRONT = Camera((1.15, 0.0, 0.65), (0.53, 0.0, 0.05), (-1.0, 0.0, 1.0), 36.0, (240, 320))
-"""Camera of films."""
+OVERHEAD = Camera((0.5, 0.0, 0.85), (0.5, 0.0, 0.0), (1.0, 0.0, 0.0), 45.0, (64, 64))  # Camera of the model
+FRONT = Camera((1.15, 0.0, 0.65), (0.53, 0.0, 0.05), (-1.0, 0.0, 1.0), 36.0, (240, 320))  # Camera of films
 
 
 NAME, WIDE_NAME = "tabletop", "tabletop_wide"
@@ -74,14 +72,10 @@ FEATURES = {IMAGE: Feature((3, *OVERHEAD.size), "image"), POSE: Feature((8,), st
 
 Position and opening are the initial state of a plan, up to the arm's lag of millimetres behind the command.
 """
-SEEN = Feature((5, 4))
-"""Privileged feature: visibility and centre (m) of each object, only for images of a training set."""
-ACTION = 4
-"""Size of an action: position of the hand (m) and opening of the gripper (m)."""
-HERTZ = 10
-"""Actions per second."""
-MAX_STEPS = 160
-"""Maximum steps per episode, as in the paper: 16 seconds."""
+SEEN = Feature((5, 4))  # Privileged feature: visibility and centre (m) of each object, only for images of a training set
+ACTION = 4  # Size of an action: position of the hand (m) and opening of the gripper (m)
+HERTZ = 10  # Actions per second
+MAX_STEPS = 160  # Maximum steps per episode, as in the paper: 16 seconds
 OPEN, THRESHOLD = 0.08, 0.06
 """Opening of an open gripper in metres, and threshold above which an action opens the gripper instead of closing it."""
 
@@ -102,14 +96,12 @@ PUSH_TO_WHITE = "push green circle to elevated white surface"
 PUSH_TO_BOOK = "push green circle to book"
 BESIDE_TRIANGLE = "pick green circle to beside orange triangle"
 
-TRAINING_CONCEPTS = (TO_BOOK, TO_WHITE, PUSH, AROUND_BOWL)
-"""Training concepts of the paper."""
+TRAINING_CONCEPTS = (TO_BOOK, TO_WHITE, PUSH, AROUND_BOWL)  # Training concepts of the paper
 WIDE_CONCEPTS = (*TRAINING_CONCEPTS, PUSH_TO_BOWL, PUSH_TO_WHITE, BESIDE_TRIANGLE)
 """Training concepts of the wide model: more pushes and picks, none of which is an evaluation task."""
 TASKS = (*TRAINING_CONCEPTS, PUSH_ON_BOOK, BESIDE_BOWL, PUSH_TO_BOWL, PUSH_TO_WHITE, PUSH_TO_BOOK, BESIDE_TRIANGLE)
 PUSHES = tuple(task for task in TASKS if task.startswith("push"))
-BESIDE = (BESIDE_BOWL, BESIDE_TRIANGLE)
-"""Picks that end on the table."""
+BESIDE = (BESIDE_BOWL, BESIDE_TRIANGLE)  # Picks that end on the table
 
 SUITES = {
     "training": training_suite(TRAINING_CONCEPTS),
@@ -140,20 +132,13 @@ HAND, POINTS, MOVED = "hand", "points", "moved"
 ORIGIN = "origin"
 """Feature of the hand position in the image: column and row, -1..1, with the view ``hand``; x and y from the centre, in half
 images, with ``points``."""
-SHIFT = 0.07
-"""Maximum shift of a scene in metres, in x and in y."""
-RAISED = 0.05
-"""Maximum elevation in metres of half of the scenes without image, so that pushes and picks generalise to any surface."""
-TURN = 0.5
-"""Maximum rotation in radians of half of the scenes; others are rotated by any angle."""
-BLUR = (0.004, 0.004, 0.002)
-"""Standard deviation of the errors of an image encoder on new scenes, in metres, in x, y and height."""
-SURE = 6.0
-"""Visibility logit of a confident encoder."""
-HALF = OVERHEAD.eye[2] * math.tan(math.radians(OVERHEAD.angle) / 2)
-"""Metres of the table from the centre of an image to its edge."""
-MIDDLE = OVERHEAD.target[:2]
-"""x and y of the centre of an image."""
+SHIFT = 0.07  # Maximum shift of a scene in metres, in x and in y
+RAISED = 0.05  # Maximum elevation in metres of half of the scenes without image, so that pushes and picks generalise to any surface
+TURN = 0.5  # Maximum rotation in radians of half of the scenes; others are rotated by any angle
+BLUR = (0.004, 0.004, 0.002)  # Standard deviation of the errors of an image encoder on new scenes, in metres, in x, y and height
+SURE = 6.0  # Visibility logit of a confident encoder
+HALF = OVERHEAD.eye[2] * math.tan(math.radians(OVERHEAD.angle) / 2)  # Metres of the table from the centre of an image to its edge
+MIDDLE = OVERHEAD.target[:2]  # x and y of the centre of an image
 
 
 def moved(states: Tensor, observed: Observed, mirrored: Tensor, angles: Tensor, shifts: Tensor) -> tuple[Tensor, dict[str, Tensor]]:

@@ -34,8 +34,7 @@ from ftl_lightning.services.randomness import task_key
 CIRCLE, TRIANGLE, BOOK, WHITE, BOWL = OBJECTS = ("green circle", "orange triangle", "book", "white surface", "purple bowl")
 COLUMNS = {name: slice(4 * number, 4 * number + 4) for number, name in enumerate(OBJECTS)}
 """Columns (present, x, y, yaw) of each object."""
-HAND = slice(4 * len(OBJECTS), 4 * len(OBJECTS) + 4)
-"""Columns (x, y, z, yaw) of the hand."""
+HAND = slice(4 * len(OBJECTS), 4 * len(OBJECTS) + 4)  # Columns (x, y, z, yaw) of the hand
 SCENE = HAND.stop
 
 TARGET = {
@@ -56,21 +55,15 @@ RADIUS = {CIRCLE: 0.025, BOWL: 0.05, TRIANGLE: 0.07 / math.sqrt(3)}
 """Radii of circle and bowl, and circumradius of the triangle with sides of 7 cm."""
 SIZE = {BOOK: (0.22, 0.16), WHITE: (0.13, 0.13)}
 HEIGHT = {CIRCLE: 0.03, TRIANGLE: 0.03, BOOK: 0.03, WHITE: 0.06, BOWL: 0.045}
-WORKSPACE = ((0.36, 0.66), (-0.24, 0.24))
-"""x and y ranges of the centres of circle and triangle."""
-SIGHT = ((0.22, 0.78), (-0.34, 0.34))
-"""x and y ranges that contain every object: seen by the camera, not touched by the arm."""
-START = ((0.39, 0.45), (-0.03, 0.03), (0.17, 0.23), (-0.1, 0.1))
-"""Ranges of the hand's initial pose."""
-RING = RADIUS[BOWL] + RADIUS[CIRCLE] + 0.028
-"""Radius in metres of the circle's path around the bowl."""
+WORKSPACE = ((0.36, 0.66), (-0.24, 0.24))  # x and y ranges of the centres of circle and triangle
+SIGHT = ((0.22, 0.78), (-0.34, 0.34))  # x and y ranges that contain every object: seen by the camera, not touched by the arm
+START = ((0.39, 0.45), (-0.03, 0.03), (0.17, 0.23), (-0.1, 0.1))  # Ranges of the hand's initial pose
+RING = RADIUS[BOWL] + RADIUS[CIRCLE] + 0.028  # Radius in metres of the circle's path around the bowl
 BOWL_BESIDE = (0.008, 0.03)
 """Range in metres of the bowl's offset from the line from circle to triangle; its side decides which path is shorter."""
-APART = 0.002
-"""Minimum gap in metres between objects."""
+APART = 0.002  # Minimum gap in metres between objects
 
-Points = NDArray[np.float64]
-"""Corners ``(n, 2)`` of a convex outline, counter-clockwise."""
+Points = NDArray[np.float64]  # Corners (n, 2) of a convex outline, counter-clockwise
 
 
 def outline(name: str, x: float, y: float, yaw: float) -> Points:
@@ -149,14 +142,10 @@ def check(scene: Sequence[float] | NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 Rng = np.random.Generator
-Pose = tuple[float, float, float]
-"""x, y and yaw."""
-_Placed = dict[str, Pose]
-"""Poses by object name."""
-PRESENT = 0.7
-"""Probability of a distractor, if it fits; without distractors the image reveals the task."""
-TRIES = 30
-"""Maximum number of positions tried per object."""
+Pose = tuple[float, float, float]  # x, y and yaw
+_Placed = dict[str, Pose]  # Poses by object name
+PRESENT = 0.7  # Probability of a distractor, if it fits; without distractors the image reveals the task
+TRIES = 30  # Maximum number of positions tried per object
 
 
 def anywhere(rng: Rng) -> tuple[float, float]:
@@ -309,13 +298,10 @@ def scenes(task: str, count: int, seed: int) -> Tensor:
     return torch.from_numpy(np.stack(drawn))
 
 
-SURFACES = (BOOK, WHITE)
-"""Objects that can carry the triangle."""
-RAISED = 0.5
-"""Probability of a triangle on a surface, if one is visible."""
+SURFACES = (BOOK, WHITE)  # Objects that can carry the triangle
+RAISED = 0.5  # Probability of a triangle on a surface, if one is visible
 
-HIDDEN: Pose = (-5.0, 0.0, 0.0)
-"""Position of objects that an image does not show."""
+HIDDEN: Pose = (-5.0, 0.0, 0.0)  # Position of objects that an image does not show
 
 
 def free_pose(rng: np.random.Generator, name: str, taken: Mapping[str, Points]) -> tuple[float, Pose]:

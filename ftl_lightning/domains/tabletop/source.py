@@ -41,16 +41,11 @@ from ftl_lightning.services.randomness import VALIDATION_SEED, task_key
 
 _LOG = logging.getLogger(__name__)
 
-MOST = 4
-"""Maximum attempts per demonstration."""
-VERSION = 5
-"""Version of the experts; part of the cache key."""
-TIMES = {PUSH: 4}
-"""Factors of the demonstrations per training concept: the paper has 124 of the push, 29 to 31 of others."""
-RECOVERY_SEED = 2_000_000
-"""Seed offset of recovery demonstrations."""
-_NO_SETTINGS = ("ROUND", "FEATURES", "NEEDED", "TYPE_CHECKING")
-"""Constants without influence on a demonstration."""
+MOST = 4  # Maximum attempts per demonstration
+VERSION = 5  # Version of the experts; part of the cache key
+TIMES = {PUSH: 4}  # Factors of the demonstrations per training concept: the paper has 124 of the push, 29 to 31 of others
+RECOVERY_SEED = 2_000_000  # Seed offset of recovery demonstrations
+_NO_SETTINGS = ("ROUND", "FEATURES", "NEEDED", "TYPE_CHECKING")  # Constants without influence on a demonstration
 _SETTINGS = {
     f"{module.__name__.rpartition('.')[2]}.{name}": value
     for module in (environment, experts, layouts, world)
@@ -181,8 +176,7 @@ def _stayed(values: list[Any]) -> NDArray[Any]:
 
 Job = tuple[str, int, int, bool, bool]
 """Task, seed, episode number, whether distractors are scattered in each image, and whether the episode is a recovery."""
-_ENVIRONMENT: list[TableTopEnvironment] = []
-"""Environment of this process."""
+_ENVIRONMENT: list[TableTopEnvironment] = []  # Environment of this process
 
 
 def _scene(job: Job) -> np.ndarray:
