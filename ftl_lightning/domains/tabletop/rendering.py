@@ -23,10 +23,7 @@ _OPEN, _CLOSED = (0, 150, 255), (255, 0, 90)  # Colours of a plan's states in a 
 
 
 def render(states: Tensor, right: Sequence[bool] | None, title: str, starts: InitialStates | None) -> Figure:
-    """Grid of tables from above with the hand's paths of plans ``(sample, horizon, 4)``; without scenes, paths only.
-
-    Frames are green for right plans, red for wrong plans, and grey for ``None``.
-    """
+    """Tables from above with the hand's paths of plans ``(sample, horizon, 4)``; frames are green, red, or grey for ``None``."""
     columns = min(len(states), MAX_COLUMNS)
     rows = -(-len(states) // columns)
     figure = Figure(figsize=(2.2 * columns, 1.8 * rows + 0.4), layout="constrained")
@@ -59,10 +56,9 @@ def film(rollout: Rollout, plans: Tensor) -> list[NDArray[np.uint8]]:
     check_simulator()
     from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
 
-    trace = rollout.infos[0].get("trace", [])
+    trace, pictures = rollout.infos[0].get("trace", []), []
     times = np.unique(np.linspace(0, max(len(trace) - 1, 0), FRAMES).round().astype(int))
     env = TableTopEnvironment(arm_drawn=True)
-    pictures = []
     try:
         env.reset(options={"scene": rollout.starts.require_scenes()[0].numpy()})
         for time in times:

@@ -59,25 +59,22 @@ class Bodies:
 
 def build(client: Simulator, scene: NDArray[np.float32], arm_drawn: bool) -> Bodies:
     """Build a valid scene after a full reset of the simulator; without the arm, images take a twentieth of the time."""
+    import pybullet_data
+
     client.resetSimulation()
     client.setGravity(0, 0, -9.81)
     client.setPhysicsEngineParameter(fixedTimeStep=STEP, deterministicOverlappingPairs=1)
     _box(client, (0.9, 1.0, 0.04), (0.5, 0.0, -0.02), TABLE_COLOUR, 0.0, TABLE_FRICTION)
     # Collision shapes load faster than visual shapes; they are made invisible.
     flags = 0 if arm_drawn else pybullet().URDF_IGNORE_VISUAL_SHAPES
-    robot: int = client.loadURDF(_panda(), [0, 0, 0], useFixedBase=True, flags=flags)
+    panda = Path(pybullet_data.getDataPath()) / "franka_panda" / "panda.urdf"
+    robot: int = client.loadURDF(str(panda), [0, 0, 0], useFixedBase=True, flags=flags)
     for link in () if arm_drawn else range(-1, client.getNumJoints(robot)):
         client.changeVisualShape(robot, link, rgbaColor=[1, 1, 1, 0])
     for finger in FINGERS:
         client.changeDynamics(robot, finger, lateralFriction=FINGER_FRICTION)
     objects = {name: _object(client, scene, name, arm_drawn) for name in OBJECTS if scene[COLUMNS[name]][0] > 0.5}
     return Bodies(robot, objects)
-
-
-def _panda() -> str:
-    import pybullet_data
-
-    return str(Path(pybullet_data.getDataPath()) / "franka_panda" / "panda.urdf")
 
 
 def turned(yaw: float) -> tuple[float, float, float, float]:
@@ -100,13 +97,9 @@ def _box(
     yaw: float = 0.0,
 ) -> int:
     half = [edge / 2 for edge in size]
-    body: int = client.createMultiBody(
-        mass,
-        client.createCollisionShape(pybullet().GEOM_BOX, halfExtents=half),
-        client.createVisualShape(pybullet().GEOM_BOX, halfExtents=half, rgbaColor=[*colour, 1]),
-        place,
-        turned(yaw),
-    )
+    shape = client.createCollisionShape(pybullet().GEOM_BOX, halfExtents=half)
+    seen = client.createVisualShape(pybullet().GEOM_BOX, halfExtents=half, rgbaColor=[*colour, 1])
+    body: int = client.createMultiBody(mass, shape, seen, place, turned(yaw))
     client.changeDynamics(body, -1, lateralFriction=friction)
     return body
 
