@@ -55,7 +55,7 @@ BLENDED = (8, 12)  # Minimum and maximum frames of the transition to the recorde
 
 
 def begun_elsewhere(states: Tensor, observed: Observed, draw: torch.Generator | None) -> tuple[Tensor, Observed]:
-    """Start half of the windows ``(sample, frame, 42)`` in a pose of standing or walking with arms down; ``draw=None``: none.
+    """Start half of the windows ``(sample, frame, 42)`` in a standing or walking pose with arms down; none without ``draw``.
 
     Demonstrations start at rest; without this augmentation, no window leaves a stride. Frames of the transition to the recording
     are means of pose and recording with cosine weights, and with the bone lengths of the recording.

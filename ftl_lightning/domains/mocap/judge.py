@@ -38,7 +38,8 @@ RESTING = ("pose", STAND, OTHER)  # Classes of windows without movement
 CONFIRMED = -3.0
 """Minimum mean verifier logit of a confirmed action: low, as new people differ from those trained on."""
 VERIFIED = {"walk": CONFIRMED, "jump": CONFIRMED, "jumping jacks": CONFIRMED, "knee raise": CONFIRMED, "arm circle": 2.2}
-"""Minimum mean logits of the verified actions. Circles, recorded in all sizes, need more; for others it rejects too many people."""
+"""Minimum mean logits of the verified actions; for others, verifiers reject too many new people. Circles need more: a third of a
+large circle is hardly smaller than a small circle."""
 _SIXTH = FPS // 6
 _OUTLIER = 5.0  # Standard deviations at which features are clipped
 

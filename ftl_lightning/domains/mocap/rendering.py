@@ -28,7 +28,10 @@ COLOURS = tuple(TRUNK if {*bone} <= _TRUNK else RIGHT if bone[0] in skeleton.RIG
 
 
 def wireframe(states: Tensor) -> Wireframe:
-    """Wireframe of a motion ``(frame, 42)`` in metres on a floor, which is below the lowest joint in every frame."""
+    """Wireframe of a motion ``(frame, 42)`` in metres on a floor.
+
+    The floor is unknown, and below the lowest joint in every frame: squats come down, and jumps only stretch.
+    """
     points = np.ascontiguousarray(as_joints(states.detach().cpu()).numpy(), dtype=np.float32)
     up = np.zeros(3, dtype=np.float32)
     up[2] = 1

@@ -68,7 +68,10 @@ Make = Callable[[str, InitialStates, Demonstrations | None, int], Policy | None]
 
 
 def _replayed(tasks: tuple[str, ...], height: float | None = None, feedback: bool = True) -> Make:
-    """Policy for ``tasks`` that replays an expert's actions, recorded in a separate simulation, bit by bit; see :func:`.moves`."""
+    """Policy for ``tasks`` that replays actions of an expert, recorded in a separate simulation; bitwise equal to the expert.
+
+    See :func:`ftl_lightning.domains.tabletop.experts.moves` for ``height`` and ``feedback``.
+    """
 
     def make(goal: str, starts: InitialStates, demonstrations: Demonstrations | None, seed: int) -> Policy | None:
         if interface.check_task(goal) not in tasks:

@@ -66,7 +66,8 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
 
     Observations are :data:`FEATURES`. An action is the target position of the hand in 0.1 s and the gripper opening; the hand
     points down with constant yaw. An episode is a function of scene and actions alone. It ends when the circle touches the
-    triangle or is released, and after :data:`MAX_STEPS` steps; the simulation can continue.
+    triangle or is released, and after :data:`MAX_STEPS` steps; the simulation can continue. Every instance has a separate
+    simulator, without display; a ``UserError`` if it does not start.
 
     Keys of the info: positions of ``circle``, ``triangle`` and book (``book place``), ``None`` for absent objects; displacement of
     the ``book`` in metres; whether the circle ``touched`` the triangle, and names of all touched objects (``touches``); whether

@@ -96,7 +96,8 @@ SUITES = {
     "representation": Suite((EvaluationTask("training representation", PUSH_ON_BOOK, texts=(PUSH,)),)),
     "validation": Suite((EvaluationTask("new concept", BESIDE_BOWL, (BESIDE_BOWL,)),)),
 }
-"""``representation`` is the paper's baseline: scenes of the new task with the text of the push on the table."""
+"""The validation task is of another kind, so that nothing is tuned on the evaluation task. ``representation`` is the paper's
+baseline: scenes of the new task with the text of the push on the table."""
 WIDE_SUITES = {
     "training": training_suite(WIDE_CONCEPTS),
     "paper": SUITES["paper"],

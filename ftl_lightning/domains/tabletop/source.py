@@ -246,15 +246,8 @@ class Expert:
         self, task: str, count: int, seed: int, workers: int = 1, scatter: bool = False, elsewhere: bool = False
     ) -> Demonstrations:
         """``count`` demonstrations of a task, see :func:`demonstrations`."""
-        settings = {
-            "domain": NAME,
-            "task": interface.check_task(task),
-            "count": count,
-            "seed": seed,
-            "experts": VERSION,
-            **_SETTINGS,
-        }
-        settings |= {"scatter": scatter, "elsewhere": elsewhere}
+        settings = {"domain": NAME, "task": interface.check_task(task), "count": count, "seed": seed, "experts": VERSION}
+        settings |= {**_SETTINGS, "scatter": scatter, "elsewhere": elsewhere}
         made = cached(settings, count, lambda progress: demonstrations(task, count, seed, workers, progress, scatter, elsewhere))
         return made if made.domain == self.domain else replace(made, domain=self.domain)
 
