@@ -1,8 +1,6 @@
-"""Acclaim skeletons (ASF) and motion (AMC), by forward kinematics.
-
-A bone of length l and direction d rotates by ``R = parent R * C * M * C^-1``, with its ``axis`` C and the degrees of freedom M of
-a frame, and ends at ``l * R d`` from the end of its parent (M. Lander, Working with motion capture file formats, 1998). Rotations
-named XYZ apply x first: ``Rz Ry Rx``.
+"""Acclaim skeletons (ASF) and motion (AMC): a bone of length l and direction d rotates by ``R = parent R * C * M * C^-1``, with
+axis C and degrees of freedom M, and ends at ``l * R d`` from the end of its parent (M. Lander, Working with motion capture file
+formats, 1998). Rotations named XYZ apply x first: ``Rz Ry Rx``.
 """
 
 import math
@@ -17,8 +15,7 @@ from scipy.spatial.transform import Rotation
 from ftl_lightning.services.errors import UserError, require
 from ftl_lightning.services.files import most_bytes, read_text
 
-INCH = 0.0254
-"""Metres. Lengths in the database are inches after division by ``length`` in the skeleton's ``units``."""
+INCH = 0.0254  # Metres. Lengths in the database are inches after division by length in the skeleton's units.
 ROOT = "root"
 JOINT_BONES = (
     "rhipjoint", "rfemur", "rtibia", "lhipjoint", "lfemur", "ltibia", "rclavicle", "rhumerus", "rradius", "lclavicle", "lhumerus",
@@ -26,53 +23,32 @@ JOINT_BONES = (
 )  # fmt: skip
 """Bones whose ends are the joints, in their order."""
 THORAX = "thorax"
-_NUMBERS = {"direction": 3, "length": 1, "axis": 3}
-"""Count of numbers per key of a bone."""
-_CHANNELS = ("TX", "TY", "TZ", "RX", "RY", "RZ")
+_NUMBERS = {"direction": 3, "length": 1, "axis": 3}  # Count of numbers per key of a bone
+_CHANNELS: tuple[str, ...] = ("TX", "TY", "TZ", "RX", "RY", "RZ")
 
 
 @dataclass(frozen=True)
 class Bone:
-    """A bone.
+    """A bone in the rest pose."""
 
-    Attributes:
-        parent: name of the parent bone, or ``'root'``.
-        reach: ``(3,)`` from start to end in the rest pose, in the file's units.
-        axis: rotation of the bone's axes relative to the world in the rest pose.
-        dof: degrees of freedom in the order of the motion's numbers, such as ``('rx', 'rz')``.
-    """
-
-    parent: str
-    reach: NDArray[np.float64]
-    axis: Rotation
-    dof: tuple[str, ...]
+    parent: str  # name of a bone, or "root"
+    reach: NDArray[np.float64]  # (3,) from start to end, in the file's units
+    axis: Rotation  # of the bone's axes relative to the world
+    dof: tuple[str, ...]  # degrees of freedom in the order of the motion's numbers, such as ("rx", "rz")
 
 
 @dataclass(frozen=True)
 class Skeleton:
-    """Body of a subject.
+    """Body of a subject."""
 
-    Attributes:
-        metres: metres per unit of the file.
-        order: order of the root's numbers, such as ``('TX', 'TY', 'TZ', 'RX', 'RY', 'RZ')``.
-        position: ``(3,)`` of the root in the rest pose, in the file's units.
-        orientation: of the root in the rest pose.
-        bones: by name, parents first.
-    """
-
-    metres: float
-    order: tuple[str, ...]
-    position: NDArray[np.float64]
-    orientation: Rotation
-    bones: dict[str, Bone]
+    metres: float  # per unit of the file
+    order: tuple[str, ...]  # of the root's numbers, such as ("TX", "TY", "TZ", "RX", "RY", "RZ")
+    position: NDArray[np.float64]  # (3,) of the root in the rest pose, in the file's units
+    orientation: Rotation  # of the root in the rest pose
+    bones: dict[str, Bone]  # by name, parents first
 
     def joints(self, motion: dict[str, NDArray[np.float64]]) -> NDArray[np.float64]:
-        """Joint positions ``(frame, 14, 3)`` in metres, y up.
-
-        Args:
-            motion: of the root ``(frame, 6)`` and of each moving bone ``(frame, dof)``, in degrees; others stay at rest.
-        """
-        frames = len(motion[ROOT])
+        """Joint positions ``(frame, 14, 3)`` in metres, y up, of a motion of :func:`read_amc`; bones without motion rest."""
         channels = [name.lower() for name in self.order]
         moved = np.stack([motion[ROOT][:, channels.index(name)] for name in ("tx", "ty", "tz")], axis=1)
         turned = _turns(motion[ROOT], channels, "".join(name[1] for name in channels if name[0] == "r"))
@@ -83,7 +59,7 @@ class Skeleton:
             if bone.dof and name in motion:
                 turn = turn * bone.axis * _turns(motion[name], bone.dof) * bone.axis.inv()
             turns[name] = turn
-            ends[name] = ends[bone.parent] + np.broadcast_to(turn.apply(bone.reach), (frames, 3))
+            ends[name] = ends[bone.parent] + turn.apply(bone.reach)
         return np.stack([ends[name] for name in JOINT_BONES], axis=1) * self.metres
 
 
@@ -95,18 +71,12 @@ def _turns(values: NDArray[np.float64], channels: Sequence[str], order: str = "x
 
 
 def read_asf(path: Path) -> Skeleton:
-    """Read a skeleton.
-
-    Raises:
-        UserError: with file and line, if the file is malformed or not from the database.
-    """
+    """Read a skeleton; raise a ``UserError`` with file and line if the file is malformed or not from the database."""
     lines = _Lines(path)
-    length, degrees = 1.0, True
-    order: tuple[str, ...] = _CHANNELS
+    length, degrees, section, order = 1.0, True, "", _CHANNELS
     position, angles, root_order = np.zeros(3), np.zeros(3), "XYZ"
     bones: dict[str, Bone] = {}
     parents: dict[str, str] = {}
-    section = ""
     bone: dict[str, list[str]] = {}
     for words in lines:
         key = words[0].lower()
@@ -173,8 +143,7 @@ def _ordered(path: Path, bones: dict[str, Bone], parents: dict[str, str]) -> dic
 def read_amc(path: Path, skeleton: Skeleton) -> dict[str, NDArray[np.float64]]:
     """Read a motion: of the root ``(frame, 6)`` and of each bone ``(frame, dof)``, in degrees.
 
-    Raises:
-        UserError: with file and line, if the file is malformed, of another skeleton, or without frames.
+    Raise a ``UserError`` with file and line if the file is malformed, of another skeleton, or without frames.
     """
     lines = _Lines(path)
     expected = {ROOT: len(skeleton.order)} | {name: len(bone.dof) for name, bone in skeleton.bones.items()}
@@ -239,10 +208,10 @@ class _Lines:
         return float(self.numbers([self.word(words, place)], 1)[0])
 
     def numbers(self, words: Sequence[str], count: int) -> NDArray[np.float64]:
+        """Words as ``count`` finite numbers."""
         return np.array(self.floats(words, count))
 
     def floats(self, words: Sequence[str], count: int) -> list[float]:
-        """Words as ``count`` finite numbers."""
         try:
             values = [float(word) for word in words]
         except ValueError:

@@ -1,7 +1,4 @@
-"""BVH files: reading by forward kinematics, and export, readable by Blender and other animation software.
-
-A joint may also have a position per frame, which replaces its offset, as in Blender.
-"""
+"""BVH files, read and written: a position of a joint per frame replaces its offset, as in Blender."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,42 +17,28 @@ from ftl_lightning.services.errors import UserError, require, short
 from ftl_lightning.services.files import read_text
 
 Numbers = NDArray[np.float64]
-END = "EndSite"
-"""Prefix of the name of an end site, before its joint's name."""
+END = "EndSite"  # Prefix of the name of an end site, before its joint's name
 _POSITIONS = {f"{axis}position": number for number, axis in enumerate("XYZ")}
 _ROTATIONS = {f"{axis}rotation": number for number, axis in enumerate("XYZ")}
 
 
 @dataclass(frozen=True)
 class Node:
-    """Joint or end site.
+    """Joint or end site."""
 
-    Attributes:
-        name: of the joint; of an end site, see :data:`END`.
-        parent: index of the parent; -1 for the root.
-        offset: ``(3,)`` from the parent, in the file's unit.
-        channels: names of the node's numbers in a frame, in order.
-    """
-
-    name: str
-    parent: int
-    offset: Numbers
-    channels: tuple[str, ...]
+    name: str  # of the joint; of an end site, see END
+    parent: int  # index; -1 for the root
+    offset: Numbers  # (3,) from the parent, in the file's unit
+    channels: tuple[str, ...]  # names of the node's numbers in a frame, in order
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Content of a file.
+    """Content of a file."""
 
-    Attributes:
-        nodes: parents first; the root is the first.
-        frames: ``(frame, channel)``, the nodes' numbers in sequence, angles in degrees.
-        seconds: time between frames.
-    """
-
-    nodes: tuple[Node, ...]
-    frames: Numbers
-    seconds: float
+    nodes: tuple[Node, ...]  # parents first; the root is the first
+    frames: Numbers  # (frame, channel), the nodes' numbers in sequence, angles in degrees
+    seconds: float  # between frames
 
     @property
     def names(self) -> frozenset[str]:
@@ -63,12 +46,7 @@ class Motion:
         return frozenset(node.name for node in self.nodes)
 
     def places(self, wanted: Sequence[str], offsets: Mapping[str, Numbers] | None = None) -> Numbers:
-        """Positions of nodes ``(frame, node, 3)``, in the file's unit and axes.
-
-        Args:
-            wanted: node names.
-            offsets: replacements of the file's offsets, by node name.
-        """
+        """Positions of the ``wanted`` nodes ``(frame, node, 3)``, in the file's unit and axes; ``offsets`` replace the file's."""
         count, column = len(self.frames), 0
         positions: dict[str, Numbers] = {}
         at: list[Numbers] = []
@@ -103,11 +81,7 @@ def _turned(axis: int, angles: Numbers) -> Numbers:
 
 
 def read_motion(path: Path) -> Motion:
-    """Read a motion.
-
-    Raises:
-        UserError: with the path, for a damaged file.
-    """
+    """Read a motion; raise a ``UserError`` with the path for a damaged file."""
     text = read_text(path, "BVH")
     try:
         hierarchy, mark, rest = text.partition("MOTION")
@@ -160,8 +134,7 @@ def _nodes(words: Iterator[str]) -> Iterable[Node]:
     return nodes
 
 
-METRES = INCH / 0.45
-"""Metres per unit of the conversion, which is that of the ASF files."""
+METRES = INCH / 0.45  # Metres per unit of the conversion, which is that of the ASF files
 NODES = (
     "RightUpLeg", "RightLeg", "RightFoot", "LeftUpLeg", "LeftLeg", "LeftFoot", "RightArm", "RightForeArm", "RightHand", "LeftArm",
     "LeftForeArm", "LeftHand", "Neck1", "EndSiteHead",
@@ -175,16 +148,10 @@ CONVERTED = (*NODES, *_AFTER_THORAX, _BELOW)
 def read_bvh(path: Path, skeleton: Skeleton | None) -> tuple[NDArray[np.float64], int]:
     """Joint positions ``(frame, 14, 3)`` in metres, y up, and frames per second, of a file of the conversion.
 
-    Args:
-        path: the file.
-        skeleton: skeleton of the subject, if available.
-
-    Raises:
-        UserError: with the path, for a file that is damaged or not of the conversion.
+    Raise a ``UserError`` with the path if the file is damaged or not of the conversion.
     """
-    motion = read_motion(path)
+    motion, expected = read_motion(path), "the MotionBuilder-friendly conversion of the database"
     for name in CONVERTED:
-        expected = "the MotionBuilder-friendly conversion of the database"
         require(name in motion.names, str(path), expected, f"a skeleton without {name!r}")
     return converted(motion, skeleton), round(1 / motion.seconds)
 
@@ -201,32 +168,20 @@ def converted(motion: Motion, skeleton: Skeleton | None) -> NDArray[np.float64]:
     return motion.places(NODES, put_back)[1:] * METRES
 
 
-HIPS = len(skeleton.JOINTS)
-"""Index of the middle of the hips, after those of the joints."""
-TIP = 0.08
-"""Length in metres of the head's visible bone."""
-SHORTEST = 1e-6
-"""Minimum length in metres of a bone with a direction; shorter bones do not rotate."""
+HIPS = len(skeleton.JOINTS)  # Index of the middle of the hips, after those of the joints
+TIP = 0.08  # Length in metres of the head's visible bone
+SHORTEST = 1e-6  # Minimum length in metres of a bone with a direction; shorter bones do not rotate
 
 
 class Joint(NamedTuple):
-    """Joint of an exported file.
+    """Joint of an exported file."""
 
-    Attributes:
-        name: name in the MotionBuilder-friendly conversion.
-        parent: index of the parent in :data:`TREE`; -1 for the root.
-        place: index of the joint's position.
-        tip: index of the joint at the end of the bone; ``None`` without rotation.
-        free: whether the joint has a position per frame.
-        end: whether the bone ends in an end site.
-    """
-
-    name: str
-    parent: int
-    place: int
-    tip: int | None
-    free: bool = False
-    end: bool = False
+    name: str  # in the MotionBuilder-friendly conversion
+    parent: int  # index in TREE; -1 for the root
+    place: int  # index of the joint's position
+    tip: int | None  # index of the joint at the end of the bone; None without rotation
+    free: bool = False  # whether the joint has a position per frame
+    end: bool = False  # whether the bone ends in an end site
 
 
 TREE = (
@@ -244,27 +199,20 @@ TREE = (
     Joint("LeftForeArm", 10, skeleton.L_ELBOW, skeleton.L_WRIST, end=True),
 )
 """Joints in depth-first order."""
-_NAMES = {joint.place: joint.name for joint in TREE if joint.place != HIPS} | {
-    joint.tip: f"{END}{joint.name}" for joint in TREE if joint.end and joint.tip is not None
-}
+_NAMES = {joint.place: joint.name for joint in TREE if joint.place != HIPS}
+_NAMES |= {joint.tip: f"{END}{joint.name}" for joint in TREE if joint.end and joint.tip is not None}
 EXPORTED = tuple(_NAMES[number] for number in range(len(skeleton.JOINTS)))
 """Joints and end sites of the file at the body's joints, in their order."""
 _PLACE, _TURN = "Xposition Yposition Zposition", "Zrotation Yrotation Xrotation"
 
 
 def bvh(states: Tensor) -> str:
-    """Convert a motion to the text of a BVH file.
+    """Convert a motion ``(frame, 42)`` in metres to the text of a BVH file; raise a ``UserError`` for numbers that are not finite.
 
     In the file y is up, the person faces +z, +x is the person's left, and the unit is the metre. The root is the middle of the
     hips. Joints rotate; joints without rigid bone to the parent (shoulders, neck, head) also have a position per frame, as in
     Blender. Bones have the lengths of the first frame and the rest directions of a standing pose. Rotations between frames are
     minimal, so that no arm spins about its axis.
-
-    Args:
-        states: ``(frame, 42)`` in metres.
-
-    Raises:
-        UserError: for numbers that are not finite.
     """
     require(states.isfinite().all(), "export", "motion of finite numbers", "others; draw it anew with another --seed")
     places = _places(states)
@@ -344,9 +292,7 @@ def _hierarchy(number: int, offsets: list[Numbers], ends: list[Numbers]) -> list
     joint = TREE[number]
     channels = f"6 {_PLACE} {_TURN}" if joint.free else f"3 {_TURN}"
     inside = [f"OFFSET {_line(offsets[number])}", f"CHANNELS {channels}"]
-    for child, node in enumerate(TREE):
-        if node.parent == number:
-            inside += _hierarchy(child, offsets, ends)
+    inside += [line for child, node in enumerate(TREE) if node.parent == number for line in _hierarchy(child, offsets, ends)]
     if joint.end:
         inside += ["End Site", "{", f"\tOFFSET {_line(ends[number])}", "}"]
     return [f"{'JOINT' if number else 'ROOT'} {joint.name}", "{", *(f"\t{line}" for line in inside), "}"]

@@ -11,57 +11,38 @@ from ftl_lightning.data.features import InitialStates, Observed, check_starts
 from ftl_lightning.domains.comparison import OURS, WITH_KNOTS, WITH_MODES, Compared, Comparison
 from ftl_lightning.domains.domain import ACCURACY, Concepts, Domain, Metric, Plans, Recordings, View, deferred
 from ftl_lightning.domains.mocap.judge import identity
-from ftl_lightning.domains.mocap.skeleton import (
-    COLUMNS,
-    GROUPS,
-    HORIZON,
-    L_HIP,
-    NAME,
-    OBSERVED,
-    POSE,
-    R_HIP,
-    RIGID,
-    as_joints,
-    drawn_poses,
-)
+from ftl_lightning.domains.mocap.skeleton import COLUMNS, GROUPS, HIPS, HORIZON, NAME, OBSERVED, POSE, RIGID, as_joints, drawn_poses
 from ftl_lightning.domains.mocap.source import Recorded
 from ftl_lightning.domains.mocap.tasks import NEW_CONCEPTS, SUITES, TESTED, TRAINING_CONCEPTS, action, judged
 from ftl_lightning.domains.pictures import Show
 from ftl_lightning.domains.tasks import training_suite
 from ftl_lightning.services.randomness import drawn
 
-SHORTEST = 1e-3
-"""Minimum length in metres of a generated bone with a direction; shorter bones are not changed."""
+SHORTEST = 1e-3  # Minimum length in metres of a generated bone with a direction; shorter bones are not changed
 
 
 def with_rigid_bones(states: Tensor, observed: Observed) -> Tensor:
-    """Scale rigid bones to their lengths in the initial pose.
+    """Scale rigid bones of states ``(sample, horizon, 42)`` in metres to their lengths in the initial pose :data:`POSE`.
 
-    From the origin, the middle of the hips, outwards, each joint moves along its bone with all its descendants. Directions of bones
-    are constant; recordings are unchanged.
-
-    Args:
-        states: ``(sample, horizon, 42)`` in metres.
-        observed: with :data:`POSE`, ``(sample, 42)``.
+    From the middle of the hips outwards, each joint moves along its bone with all its descendants; recordings are unchanged.
     """
     joints, start = as_joints(states), as_joints(observed[POSE])
     moved = list(joints.unbind(dim=-2))
-    for inner, outer in sorted(RIGID, key=lambda bone: bone != (R_HIP, L_HIP)):
+    for inner, outer in sorted(RIGID, key=lambda bone: bone != HIPS):
         length = torch.linalg.vector_norm(start[:, outer] - start[:, inner], dim=-1)[:, None, None]
         bone = joints[..., outer, :] - joints[..., inner, :]
         norm = torch.linalg.vector_norm(bone, dim=-1, keepdim=True)
         bone = torch.where(norm > SHORTEST, bone * (length / norm.clamp_min(SHORTEST)), bone)
-        if (inner, outer) == (R_HIP, L_HIP):
+        if (inner, outer) == HIPS:
             moved[inner] = -bone / 2
         moved[outer] = moved[inner] + bone
     return torch.stack(moved, dim=-2).flatten(-2)
 
 
 def smoothed(states: Tensor, observed: Observed) -> Tensor:
-    """Apply a running mean of three frames twice, then rigid bones; first and last frame are constant.
+    """Apply a running mean of three frames twice, then :func:`with_rigid_bones`; first and last frame are constant.
 
-    Network errors are independent between frames, motion is not: the weighted mean of five frames keeps a quarter of their
-    variance. Arguments as of :func:`with_rigid_bones`.
+    Network errors are independent between frames, motion is not: the weighted mean of five frames keeps a fourth of the variance.
     """
     for _ in range(2):
         inside = (states[:, :-2] + states[:, 1:-1] + states[:, 2:]) / 3
@@ -69,22 +50,15 @@ def smoothed(states: Tensor, observed: Observed) -> Tensor:
     return with_rigid_bones(states, observed)
 
 
-SHARE = 0.5
-"""Share of windows with another initial pose."""
-BLENDED = (8, 12)
-"""Minimum and maximum frames of the transition to the recorded window."""
+SHARE = 0.5  # Share of windows with another initial pose
+BLENDED = (8, 12)  # Minimum and maximum frames of the transition to the recorded window
 
 
 def begun_elsewhere(states: Tensor, observed: Observed, draw: torch.Generator | None) -> tuple[Tensor, Observed]:
-    """Start half of the windows in a pose of standing or walking with arms down, with a transition to the recording.
+    """Start half of the windows ``(sample, frame, 42)`` in a standing or walking pose with arms down; none without ``draw``.
 
-    Demonstrations start at rest; without this augmentation, no window leaves a stride. Frames of the transition are weighted
-    means of pose and recording with cosine weights, and with the bone lengths of the recording.
-
-    Args:
-        states: ``(sample, frame, 42)`` in metres.
-        observed: with :data:`POSE`, ``(sample, 42)``.
-        draw: generator of poses and lengths; ``None`` for no change.
+    Demonstrations start at rest; without this augmentation, no window leaves a stride. Frames of the transition to the recording
+    are means of pose and recording with cosine weights, and with the bone lengths of the recording.
     """
     if draw is None:
         return states, observed
@@ -95,8 +69,7 @@ def begun_elsewhere(states: Tensor, observed: Observed, draw: torch.Generator | 
     share = torch.arange(states.shape[1], device=device)[None, :, None] / length
     elsewhere = (drawn(count, lambda n: torch.rand((n, 1, 1), generator=draw, device=draw.device)) < SHARE).to(device)
     weight = elsewhere * (1 + torch.cos(torch.pi * share.clamp(max=1))) / 2
-    begun = with_rigid_bones(weight * poses + (1 - weight) * states, observed)
-    begun = torch.where(weight > 0, begun, states)
+    begun = torch.where(weight > 0, with_rigid_bones(weight * poses + (1 - weight) * states, observed), states)
     return begun, {**observed, POSE: begun[:, 0]}
 
 

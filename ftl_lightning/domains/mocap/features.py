@@ -1,8 +1,6 @@
-"""Motion features of the judge.
+"""Motion features of the judge, of windows ``(sample, frame, 42)`` and the visible joints (:data:`LOWER`, :data:`UPPER` or all).
 
-Joints are relative to their parents, in units of body size, with velocities: features are invariant to body size and distinguish
-frozen or trembling motion from real motion. Arguments are windows ``(sample, frame, 42)`` and the visible joints: :data:`LOWER`,
-:data:`UPPER` or all.
+Joints are relative to their parents, in units of body size, with velocities, which distinguish frozen or trembling motion.
 """
 
 from collections.abc import Sequence
@@ -16,8 +14,7 @@ from ftl_lightning.domains.mocap.skeleton import FPS, HEAD, NECK, as_joints
 RH, RK, RA, LH, LK, LA, RS, RE, RW, LS, LE, LW = range(12)
 """Joints of the right and the left side: hip, knee, ankle, shoulder, elbow, wrist."""
 JOINTS = len(skeleton.JOINTS)
-LOWER, UPPER = (RH, RK, RA, LH, LK, LA), (RS, RE, RW, LS, LE, LW, NECK, HEAD)
-"""Joints of the legs, and of arms and trunk."""
+LOWER, UPPER = (RH, RK, RA, LH, LK, LA), (RS, RE, RW, LS, LE, LW, NECK, HEAD)  # Joints of the legs, and of arms and trunk
 PARENT = {RK: RH, RA: RK, LK: LH, LA: LK, HEAD: NECK, RS: NECK, LS: NECK, RE: RS, LE: LS, RW: RE, LW: LE}
 """Parent of each joint, from the hips outwards; parent of hips and neck is the origin, the middle of the hips."""
 _FREQUENCIES = 6
@@ -57,8 +54,7 @@ def signals(states: Tensor, joints: Sequence[int]) -> Tensor:
     where = places(relative)
     velocity = torch.diff(where, dim=1) * (FPS / 3)
     velocity = torch.cat([velocity[:, :1], velocity], dim=1)
-    chosen = list(joints)
-    return torch.cat([values[:, :, chosen] for values in (relative, where, velocity)], dim=2).flatten(2).transpose(1, 2)
+    return torch.cat([values[:, :, list(joints)] for values in (relative, where, velocity)], dim=2).flatten(2).transpose(1, 2)
 
 
 def _log(values: Tensor, floor: float) -> Tensor:
@@ -72,28 +68,17 @@ def _of_joints(where: Tensor) -> Tensor:
     change = torch.linalg.vector_norm(torch.diff(velocity, dim=1), dim=-1)
     high, low = where.amax(dim=1), where.amin(dim=1)
     waves = torch.fft.rfft(where - where.mean(dim=1, keepdim=True), dim=1).abs()[:, 1 : 1 + _FREQUENCIES] / where.shape[1]
-    return torch.cat(
-        [
-            where.mean(dim=1),
-            _log(where.std(dim=1), 0.01),
-            _log(high - low, 0.03),
-            high,
-            low,
-            _log(torch.stack([speed.mean(dim=1), speed.std(dim=1), speed.amax(dim=1), speed.amin(dim=1)], dim=-1), 0.02),
-            _log(change.mean(dim=1), 0.1)[..., None],
-            _log(velocity.abs().mean(dim=1), 0.003),
-            _log(waves, 0.003).permute(0, 2, 3, 1).flatten(2),
-        ],
-        dim=-1,
-    )
+    speeds = torch.stack([speed.mean(dim=1), speed.std(dim=1), speed.amax(dim=1), speed.amin(dim=1)], dim=-1)
+    features = [where.mean(dim=1), _log(where.std(dim=1), 0.01), _log(high - low, 0.03), high, low, _log(speeds, 0.02)]
+    features += [_log(change.mean(dim=1), 0.1)[..., None], _log(velocity.abs().mean(dim=1), 0.003)]
+    return torch.cat([*features, _log(waves, 0.003).permute(0, 2, 3, 1).flatten(2)], dim=-1)
 
 
 def _of_course(values: Tensor) -> Tensor:
     """Mean, spread, extremes and rate of change ``(sample, 5)`` of a time series ``(sample, frame)``."""
     change = torch.diff(values, dim=1).abs().mean(dim=1) * FPS
-    return torch.stack(
-        [values.mean(dim=1), _log(values.std(dim=1), 0.02), values.amax(dim=1), values.amin(dim=1), _log(change, 0.1)], dim=1
-    )
+    spread = _log(values.std(dim=1), 0.02)
+    return torch.stack([values.mean(dim=1), spread, values.amax(dim=1), values.amin(dim=1), _log(change, 0.1)], dim=1)
 
 
 def _sides(right: Tensor, left: Tensor) -> list[Tensor]:
@@ -121,12 +106,9 @@ def _together(first: Tensor, second: Tensor) -> Tensor:
 def _alike(where: Tensor, right: int, left: int) -> list[Tensor]:
     """Correlations of a right and a left joint: sideways, forwards, upwards, in speed."""
     speed = torch.linalg.vector_norm(torch.diff(where, dim=1), dim=-1)
-    return [
-        _together(-where[:, :, right, 0], where[:, :, left, 0]),
-        _together(where[:, :, right, 1], where[:, :, left, 1]),
-        _together(where[:, :, right, 2], where[:, :, left, 2]),
-        _together(speed[:, :, right], speed[:, :, left]),
-    ]
+    forwards, upwards = (_together(where[:, :, right, axis], where[:, :, left, axis]) for axis in (1, 2))
+    sideways = _together(-where[:, :, right, 0], where[:, :, left, 0])
+    return [sideways, forwards, upwards, _together(speed[:, :, right], speed[:, :, left])]
 
 
 def _distances(where: Tensor, *pairs: tuple[int, int]) -> list[Tensor]:
@@ -135,25 +117,27 @@ def _distances(where: Tensor, *pairs: tuple[int, int]) -> list[Tensor]:
     return _sides(*courses) if len(courses) == 2 else courses
 
 
+def _angles(right: Tensor, to: Tensor, left: Tensor, left_to: Tensor) -> list[Tensor]:
+    """Features of the angles between two vectors on the right and on the left side."""
+    return _sides(_of_course(_angle(right, to)), _of_course(_angle(left, left_to)))
+
+
 def _upper(where: Tensor, limbs: Tensor) -> list[Tensor]:
     """Features of arms and trunk."""
     neck, up = where[:, :, NECK], where.new_tensor((0.0, 0.0, 1.0))
     shoulders = where[:, :, RS] - where[:, :, LS]
     turn, side = torch.atan2(shoulders[..., 1], shoulders[..., 0]), torch.atan2(neck[..., 0], neck[..., 2])
-
-    def angles(right: Tensor, left: Tensor) -> list[Tensor]:
-        return _sides(_of_course(right), _of_course(left))
-
+    limb = limbs.unbind(dim=2)
     return [
-        *angles(_angle(limbs[:, :, RE], limbs[:, :, RW]), _angle(limbs[:, :, LE], limbs[:, :, LW])),
-        *angles(_angle(limbs[:, :, RE], -neck), _angle(limbs[:, :, LE], -neck)),
-        *angles(_angle(limbs[:, :, RE], up), _angle(limbs[:, :, LE], up)),
-        *angles(_angle(limbs[:, :, RW], up), _angle(limbs[:, :, LW], up)),
+        *_angles(limb[RE], limb[RW], limb[LE], limb[LW]),
+        *_angles(limb[RE], -neck, limb[LE], -neck),
+        *_angles(limb[RE], up, limb[LE], up),
+        *_angles(limb[RW], up, limb[LW], up),
         _of_course(turn.abs()),
         _spread(turn),
         _of_course(_angle(neck, up)),
         _spread(side),
-        _of_course(_angle(limbs[:, :, HEAD], neck)),
+        _of_course(_angle(limb[HEAD], neck)),
         *_distances(where, (RW, LW)),
         *_distances(where, (RW, HEAD), (LW, HEAD)),
         *_distances(where, (RS, LW), (LS, RW)),
@@ -165,15 +149,11 @@ def _upper(where: Tensor, limbs: Tensor) -> list[Tensor]:
 def _lower(where: Tensor, limbs: Tensor) -> list[Tensor]:
     """Features of the legs."""
     down = where.new_tensor((0.0, 0.0, -1.0))
-    features: list[Tensor] = []
-    for right, left in (
-        (_angle(limbs[:, :, RK], limbs[:, :, RA]), _angle(limbs[:, :, LK], limbs[:, :, LA])),
-        (_angle(limbs[:, :, RK], down), _angle(limbs[:, :, LK], down)),
-        (_angle(limbs[:, :, RA], down), _angle(limbs[:, :, LA], down)),
-    ):
-        features += _sides(_of_course(right), _of_course(left))
+    limb = limbs.unbind(dim=2)
     return [
-        *features,
+        *_angles(limb[RK], limb[RA], limb[LK], limb[LA]),
+        *_angles(limb[RK], down, limb[LK], down),
+        *_angles(limb[RA], down, limb[LA], down),
         _of_course(-where[:, :, [RA, LA], 2].amin(dim=-1)),
         _of_course((where[:, :, RA, 0] - where[:, :, LA, 0]).abs()),
         *_distances(where, (RA, LA)),
@@ -204,13 +184,10 @@ def summary(states: Tensor, joints: Sequence[int]) -> Tensor:
     where = places(limbs)
     right = [joint for joint in (RK, RA, RS, RE, RW) if joint in joints]
     left = [skeleton.MIRROR[joint] for joint in right]
-    features = [
-        values.flatten(1)
-        for values in _sides(_of_joints(where[:, :, right]), _of_joints(where[:, :, left] * where.new_tensor(_SIDEWAYS)))
-    ]
+    sides = _sides(_of_joints(where[:, :, right]), _of_joints(where[:, :, left] * where.new_tensor(_SIDEWAYS)))
+    features = [values.flatten(1) for values in sides]
     if NECK in joints:
-        middle = where[:, :, [NECK, HEAD]]
-        # Sideways distance only, for invariance to mirroring.
+        middle = where[:, :, [NECK, HEAD]]  # with the sideways distance only, for invariance to mirroring
         features.append(_of_joints(torch.cat([middle[..., :1].abs(), middle[..., 1:]], dim=-1)).flatten(1))
         features += _upper(where, limbs)
     if RK in joints:
@@ -221,10 +198,7 @@ def summary(states: Tensor, joints: Sequence[int]) -> Tensor:
 
 
 def turns(states: Tensor, joints: Sequence[int]) -> Tensor:
-    """Roundness of joint paths, invariant to mirroring: ``(sample, feature)``.
-
-    A path to and fro on a line has one extent and no area; a circle has two equal extents.
-    """
+    """Roundness of joint paths, invariant to mirroring ``(sample, feature)``: a circle has two equal extents, a line no area."""
     where = places(_in_sizes(states))
     right = [joint for joint in (RK, RA, RE, RW) if joint in joints]
     features: list[Tensor] = []
@@ -240,10 +214,7 @@ def turns(states: Tensor, joints: Sequence[int]) -> Tensor:
 
 
 def _extremes(values: Tensor) -> Tensor:
-    """Extremes ``(sample, 8)`` of both sides' time series ``(sample, frame, 2)``.
-
-    Highest, lowest and mean of the larger and of the smaller side, and the extremes that both reach at once.
-    """
+    """Extremes ``(sample, 8)`` of both sides' time series ``(sample, frame, 2)``, by side and that both reach at once."""
     courses = torch.stack([values.amax(dim=1), values.amin(dim=1), values.mean(dim=1)], dim=1)
     at_once = torch.stack([values.amin(dim=-1).amax(dim=1), values.amax(dim=-1).amin(dim=1)], dim=1)
     return torch.cat([courses.amax(dim=-1), courses.amin(dim=-1), at_once], dim=1)
@@ -263,10 +234,8 @@ def _both(where: Tensor, right: int, axis: int) -> Tensor:
 
 def _bent(limbs: Tensor, upper: int, lower: int) -> Tensor:
     """Flexion of a joint on both sides in radians ``(sample, frame, 2)``."""
-    mirror = skeleton.MIRROR
-    return torch.stack(
-        [_angle(limbs[:, :, upper], limbs[:, :, lower]), _angle(limbs[:, :, mirror[upper]], limbs[:, :, mirror[lower]])], dim=-1
-    )
+    sides = ((upper, lower), (skeleton.MIRROR[upper], skeleton.MIRROR[lower]))
+    return torch.stack([_angle(limbs[:, :, a], limbs[:, :, b]) for a, b in sides], dim=-1)
 
 
 def _pair_together(values: Tensor) -> Tensor:
@@ -274,10 +243,7 @@ def _pair_together(values: Tensor) -> Tensor:
 
 
 def extremes(states: Tensor, joints: Sequence[int]) -> Tensor:
-    """Fewer window features for a second linear classifier, invariant to mirroring: ``(sample, feature)``.
-
-    Extremes of height, distance, flexion and speed, on the more and on the less active side.
-    """
+    """Extremes of height, distance, flexion and speed, for a second classifier, invariant to mirroring: ``(sample, feature)``."""
     limbs = _in_sizes(states)
     where = places(limbs)
     velocity = torch.diff(where, dim=1) * FPS
@@ -313,6 +279,5 @@ def extremes(states: Tensor, joints: Sequence[int]) -> Tensor:
     if NECK in joints and RK in joints:
         legs, arms = (_log(speed[:, :, pair].mean(dim=1), 0.05).mean(dim=1, keepdim=True) for pair in ([RA, LA], [RW, LW]))
         features += [legs - arms, _together(where[:, :, [RW, LW], 2].mean(dim=-1), apart.abs())]
-        for right, left in (((RW, RA), (LW, LA)), ((RW, LA), (LW, RA))):
-            features.append(_ways_together(where, right, left, 1))
+        features += [_ways_together(where, right, left, 1) for right, left in (((RW, RA), (LW, LA)), ((RW, LA), (LW, RA)))]
     return torch.cat(features, dim=1)

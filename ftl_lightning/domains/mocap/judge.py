@@ -1,10 +1,8 @@
-"""Judge: classifier of the action in a window of motion, trained on recordings of people.
+"""Judge: classifier of the action in a window of motion, trained by ``benchmarks/experiments/mocap_judge.py`` on recordings.
 
-An ensemble averages three kinds of classifiers: small convolutional networks over time, and two linear classifiers on window
-features. There are ensembles for the whole body, for arms and trunk, and for the legs, so that simultaneous actions are judged
-separately. An ensemble picks the likeliest action, even if half of it is missing. Verifiers of the whole body therefore reject hard
-negatives, such as an action's arms on the legs of a walk, or an action at a third of its size. Training excludes generated motion
-and demonstrators of new concepts. ``benchmarks/experiments/mocap_judge.py`` trains the judge.
+Ensembles of convolutional networks and linear classifiers judge the whole body, arms with trunk, and legs separately. An ensemble
+picks the likeliest action, even if half of it is missing; verifiers of the whole body therefore reject hard negatives, such as an
+action's arms on the legs of a walk. Training excludes generated motion and demonstrators of new concepts.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,8 +21,7 @@ from ftl_lightning.services.shipped import shipped
 from ftl_lightning.services.tensor_file import file_hash, load_tensors, save_tensors
 
 KIND = "motion judge"
-PATH = Path("pretrained/mocap/judge.safetensors")
-"""File of the shipped judge."""
+PATH = Path("pretrained/mocap/judge.safetensors")  # File of the shipped judge
 WHOLE, ARMS, LEGS = "whole", "arms", "legs"
 PARTS: Mapping[str, tuple[tuple[int, ...], tuple[str, ...]]] = {
     WHOLE: ((*LOWER, *UPPER), CLASSES),
@@ -32,30 +29,19 @@ PARTS: Mapping[str, tuple[tuple[int, ...], tuple[str, ...]]] = {
     LEGS: (LOWER, LEG_CLASSES),
 }
 """Joints and classes of each part of the judge; the trunk belongs to the arms."""
-NUMBERS = {"summary": summary, "extremes": extremes}
-"""Features of linear classifiers by name."""
-VERIFIED_BY = {**NUMBERS, "turns": turns}
-"""Features of verifiers by name."""
-VERIFIER = 32
-"""Hidden units of a verifier."""
-WIDTH, EMBEDDING = 40, 32
-"""Channels and embedding size of a network."""
-STILL = 0.3
-"""Speed in metres per second. If every joint is slower over a sixth of a second, there is no action."""
-RESTING = ("pose", STAND, OTHER)
-"""Classes of windows without movement."""
+NUMBERS = {"summary": summary, "extremes": extremes}  # Features of linear classifiers by name
+VERIFIED_BY = {**NUMBERS, "turns": turns}  # Features of verifiers by name
+VERIFIER = 32  # Hidden units of a verifier
+WIDTH, EMBEDDING = 40, 32  # Channels and embedding size of a network
+STILL = 0.3  # Speed in metres per second. If every joint is slower over a sixth of a second, there is no action.
+RESTING = ("pose", STAND, OTHER)  # Classes of windows without movement
 CONFIRMED = -3.0
-"""Minimum mean verifier logit of a confirmed action: probability .05 of the whole action. It is far below one half, as new people
-perform actions a little differently from the training set. Hard negatives have lower logits."""
+"""Minimum mean verifier logit of a confirmed action: low, as new people differ from those trained on."""
 VERIFIED = {"walk": CONFIRMED, "jump": CONFIRMED, "jumping jacks": CONFIRMED, "knee raise": CONFIRMED, "arm circle": 2.2}
-"""Minimum mean logits of the verified actions.
-
-Circles need more: they were recorded in all sizes, and a third of a large circle is hardly smaller than a small circle. For
-unlisted actions, verifiers reject too many new people.
-"""
+"""Minimum mean logits of the verified actions; for others, verifiers reject too many new people. Circles need more: a third of a
+large circle is hardly smaller than a small circle."""
 _SIXTH = FPS // 6
-_OUTLIER = 5.0
-"""Standard deviations at which features are clipped."""
+_OUTLIER = 5.0  # Standard deviations at which features are clipped
 
 
 class Network(nn.Module):
@@ -90,13 +76,9 @@ class Verifier(nn.Sequential):
 
 
 class Recogniser(nn.Module):
-    """Ensemble of networks and linear classifiers with the same joints and classes.
+    """Ensemble of networks (``members``) and linear classifiers with the same visible ``joints`` and ``classes``.
 
-    Args:
-        joints: visible joints.
-        classes: class names.
-        members: number of networks.
-        verifiers: number of perceptrons that confirm whole actions; with 0, all are confirmed.
+    ``verifiers`` perceptrons confirm whole actions; with 0, all are confirmed.
     """
 
     def __init__(self, joints: Sequence[int], classes: Sequence[str], members: int = 2, verifiers: int = 0) -> None:
@@ -104,8 +86,7 @@ class Recogniser(nn.Module):
         self.joints, self.classes = tuple(joints), tuple(classes)
         still = torch.zeros(1, HORIZON, len(COLUMNS))
         channels = signals(still, joints).shape[1]
-        seen = VERIFIED_BY if verifiers else NUMBERS
-        numbers = {name: of(still, joints).shape[1] for name, of in seen.items()}
+        numbers = {name: of(still, joints).shape[1] for name, of in (VERIFIED_BY if verifiers else NUMBERS).items()}
         self.networks = nn.ModuleList(Network(channels, len(classes)) for _ in range(members))
         self.verifiers = nn.ModuleList(Verifier(sum(numbers.values()), len(classes)) for _ in range(verifiers))
         self.linear = nn.ModuleDict({name: nn.Linear(numbers[name], len(classes)) for name in NUMBERS})
@@ -134,8 +115,7 @@ class Recogniser(nn.Module):
 
     def features(self, states: Tensor) -> Tensor:
         """Embedding of the first network ``(sample, EMBEDDING)``, with about unit variance over the training windows."""
-        network = cast(Network, self.networks[0])
-        return self._scaled("embedding", network.embedding(self.courses(states)))
+        return self._scaled("embedding", cast(Network, self.networks[0]).embedding(self.courses(states)))
 
     def votes(self, states: Tensor) -> dict[str, Tensor]:
         """Log probabilities ``(sample, class)`` of the networks, and of each linear classifier."""
@@ -145,10 +125,7 @@ class Recogniser(nn.Module):
         return {"networks": networks, **linear}
 
     def forward(self, states: Tensor) -> Tensor:
-        """Mean log probabilities ``(sample, class)``.
-
-        Minus infinity for actions if no visible joint moves, or if verifiers reject the whole action.
-        """
+        """Mean log probabilities ``(sample, class)``; -inf for actions without motion, or that verifiers reject."""
         scores = torch.stack(list(self.votes(states).values())).mean(dim=0)
         actions_only = torch.tensor([name not in RESTING for name in self.classes])
         excluded = self._still(states)[:, None]
@@ -179,20 +156,12 @@ class Recogniser(nn.Module):
 
 
 class Judge(nn.Module):
-    """Ensembles by part of the body.
-
-    ``forward`` returns features of the whole body, the interface of torchmetrics.
-
-    Args:
-        members: networks per ensemble, and verifiers of the whole body.
-    """
+    """Ensembles by part of the body, each of ``members`` networks; ``forward`` returns features, as torchmetrics expects."""
 
     def __init__(self, members: int = 2) -> None:
         super().__init__()
         self.members = members
-        verifiers = {WHOLE: members}
-        parts = {name: Recogniser(*PARTS[name], members, verifiers.get(name, 0)) for name in PARTS}
-        self.parts = nn.ModuleDict(parts)
+        self.parts = nn.ModuleDict({name: Recogniser(*PARTS[name], members, members * (name == WHOLE)) for name in PARTS})
         self.num_features = EMBEDDING
         self.eval()
 
@@ -211,12 +180,9 @@ class Judge(nn.Module):
 
     @torch.no_grad()
     def recognised(self, goal: str, states: Tensor) -> Tensor:
-        """Whether windows ``(sample, 32, 42)`` show a goal: ``(sample,)`` of bool.
+        """Whether windows ``(sample, 32, 42)`` show a goal: ``(sample,)`` of bool; a ``UserError`` for a goal without an action.
 
         For two joined actions, arms and trunk show the first and the legs the second, judged independently.
-
-        Raises:
-            UserError: for a goal without an action.
         """
         names = actions(goal)
         require(names, "goal", "an action that the judge of motion knows, such as 'walk'", repr(goal))
@@ -230,16 +196,11 @@ class Judge(nn.Module):
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read a judge.
-
-        Raises:
-            UserError: for a file that is missing, damaged or of another form.
-        """
+        """Read a judge; raise a ``UserError`` for a file that is missing, damaged or of another form."""
         remedy = "take it from the project's repository, or make it with benchmarks/experiments/mocap_judge.py"
         require(Path(path).is_file(), str(path), "the judge of motion", f"nothing; {remedy}")
         tensors, header = load_tensors(path, KIND)
-        same = header.get("classes") == list(CLASSES)
-        require(same, f"{path}: key 'classes'", "those of this version", "others; train it again")
+        require(header.get("classes") == list(CLASSES), f"{path}: key 'classes'", "those of this version", "others; train it again")
         members = header.get("members")
         if not isinstance(members, int) or not 1 <= members <= 100:
             raise UserError(f"{path}: key 'members': expected a number of networks, found {members!r}; train it again")

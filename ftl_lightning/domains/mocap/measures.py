@@ -1,8 +1,7 @@
 """Measures of generated motion: kinematic rules of actions, the judge, naturalness, and distance to recordings.
 
-Rules use joints only, without training, calibrated on recordings (docs/experiments-mocap.md): a second opinion beside the trained
-judge. Trembling motion fails. Domain metrics map ``(goal, states (sample, 32, 42), initial states or None) -> (sample,)``. Other
-measures compare sets of windows by features of the judge, which was trained on neither generated motion nor the generator.
+Rules need no training and are calibrated on recordings (docs/experiments-mocap.md): a second opinion beside the judge. Metrics map
+``(goal, states (sample, 32, 42), initial states or None) -> (sample,)``; other measures compare sets of windows by the judge.
 """
 
 import warnings
@@ -14,52 +13,27 @@ from torchmetrics.image.fid import FrechetInceptionDistance
 from torchmetrics.image.kid import KernelInceptionDistance
 
 from ftl_lightning.data.features import InitialStates
+from ftl_lightning.domains.mocap import skeleton
 from ftl_lightning.domains.mocap.features import extremes
 from ftl_lightning.domains.mocap.judge import PARTS, WHOLE, Judge, shipped_judge
-from ftl_lightning.domains.mocap.skeleton import (
-    ANKLES,
-    BONES,
-    FPS,
-    HEAD,
-    HIPS,
-    KNEES,
-    L_ANKLE,
-    NECK,
-    POSE,
-    R_ANKLE,
-    RIGID,
-    SHOULDERS,
-    WRISTS,
-    as_joints,
-    bone_lengths,
-)
+from ftl_lightning.domains.mocap.skeleton import ANKLES, FPS, HIPS, KNEES, L_ANKLE, POSE, R_ANKLE, SHOULDERS, WRISTS, as_joints
 from ftl_lightning.services.errors import require
 from ftl_lightning.services.shipped import check_extra
 
-STRIDE = 0.3
-"""Minimum ankle distance in metres of a stride; closer ankles are a level pose."""
-SETTLED = 12
-"""First frame that is independent of the initial pose; synchrony and arm paths are judged from here."""
+STRIDE = 0.3  # Minimum ankle distance in metres of a stride; closer ankles are a level pose
+SETTLED = 12  # First frame that is independent of the initial pose; synchrony and arm paths are judged from here
 OVERHEAD = -0.12
 """Jumping jacks: minimum height in metres of both wrists at once above the top of the head; bent arms stay a little below it."""
-OPENED, OPEN = 0.2, 0.4
-"""Jumping jacks: minimum range and minimum peak of the sideways distance of the feet, in metres."""
-HANGING = 0.15
-"""Jumping jacks: minimum depth in metres of the hands below the shoulders at some time."""
-IN_TIME = 0.6
-"""Minimum absolute correlation of hand height and foot distance that counts as synchronous, in phase or in antiphase."""
-TURN = 240.0
-"""Minimum rotation of the arms in degrees in an arm circle, as a mean; two thirds for each arm."""
-WIDTH, ROUND = 0.12, 0.2
-"""Minimum width of the wrists' path, in metres and relative to its length, of a round path."""
+OPENED, OPEN = 0.2, 0.4  # Jumping jacks: minimum range and minimum peak of the sideways distance of the feet, in metres
+HANGING = 0.15  # Jumping jacks: minimum depth in metres of the hands below the shoulders at some time
+IN_TIME = 0.6  # Minimum absolute correlation of hand height and foot distance that counts as synchronous, in phase or in antiphase
+TURN = 240.0  # Minimum rotation of the arms in degrees in an arm circle, as a mean; two thirds for each arm
+WIDTH, ROUND = 0.12, 0.2  # Minimum width of the wrists' path, in metres and relative to its length, of a round path
 RAISED, LOWERED = 0.15, 0.3
 """Knee raise, in metres below the hips: maximum of a raised knee; minimum of this knee at another time, and of the other knee."""
-BENT, STRETCHED = 70.0, 30.0
-"""Squat, in degrees: minimum flexion of both knees at once, and minimum range of this flexion."""
-TREMBLING = 900.0
-"""Maximum jerk of an action in metres per second cubed: the 99th percentile of recorded windows."""
-UPRIGHT, ON_FEET = 0.35, 0.5
-"""Minimum distances in metres from the hips up to the neck, and down to each ankle, of an upright pose."""
+BENT, STRETCHED = 70.0, 30.0  # Squat, in degrees: minimum flexion of both knees at once, and minimum range of this flexion
+TREMBLING = 900.0  # Maximum jerk of an action in metres per second cubed: the 99th percentile of recorded windows
+UPRIGHT, ON_FEET = 0.35, 0.5  # Minimum distances in metres from the hips up to the neck, and down to each ankle, of an upright pose
 
 
 def is_stride(poses: Tensor) -> Tensor:
@@ -86,10 +60,10 @@ def _range(values: Tensor) -> Tensor:
 def upright(states: Tensor) -> Tensor:
     """Whether all poses stand or hop upright on both feet: ``(sample,)`` of bool."""
     height = as_joints(states)[..., 2]
-    return (height[..., NECK] > UPRIGHT).all(dim=1) & (height[..., list(ANKLES)] < -ON_FEET).all(dim=-1).all(dim=1)
+    return (height[..., skeleton.NECK] > UPRIGHT).all(dim=1) & (height[..., list(ANKLES)] < -ON_FEET).all(dim=-1).all(dim=1)
 
 
-def mean_jerk(states: Tensor) -> Tensor:
+def jerk(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
     """Mean jerk ``(sample,)``: size of the joints' third derivative in metres per second cubed."""
     third = torch.diff(as_joints(states), n=3, dim=1) * FPS**3
     return torch.linalg.vector_norm(third, dim=-1).mean(dim=(1, 2))
@@ -97,7 +71,7 @@ def mean_jerk(states: Tensor) -> Tensor:
 
 def calm(states: Tensor) -> Tensor:
     """Whether jerk is below that of recordings: ``(sample,)`` of bool. Jumping joints would pass through any pose."""
-    return mean_jerk(states) < TREMBLING
+    return jerk("", states, None) < TREMBLING
 
 
 def synchronous(states: Tensor) -> Tensor:
@@ -110,25 +84,17 @@ def synchronous(states: Tensor) -> Tensor:
     return (together.abs() >= IN_TIME) & wide
 
 
-def hands_overhead(states: Tensor) -> Tensor:
-    """Whether both hands are overhead at one time, and below the shoulders at another: ``(sample,)`` of bool."""
-    joints = as_joints(states)
-    wrists = joints[..., list(WRISTS), 2]
-    up = wrists.amin(dim=-1) - joints[..., HEAD, 2] > OVERHEAD
-    down = (wrists < joints[..., list(SHOULDERS), 2] - HANGING).all(dim=-1)
-    return up.any(dim=1) & down.any(dim=1)
-
-
 def jumping_jacks(states: Tensor) -> Tensor:
     """Hands overhead and down, feet open and closed in time with them, upright: ``(sample,)`` of bool."""
-    return hands_overhead(states) & synchronous(states) & upright(states) & calm(states)
+    joints = as_joints(states)
+    wrists = joints[..., list(WRISTS), 2]
+    up = wrists.amin(dim=-1) - joints[..., skeleton.HEAD, 2] > OVERHEAD
+    down = (wrists < joints[..., list(SHOULDERS), 2] - HANGING).all(dim=-1)
+    return up.any(dim=1) & down.any(dim=1) & synchronous(states) & upright(states) & calm(states)
 
 
 def _paths(states: Tensor) -> Tensor:
-    """Paths of both wrists from the side, relative to the shoulders, centred: ``(sample, frame, 2, 2)``.
-
-    The centre is that of the frames from :data:`SETTLED` on.
-    """
+    """Paths of both wrists from the side, relative to the shoulders ``(sample, frame, 2, 2)``, centred from :data:`SETTLED` on."""
     joints = as_joints(states)
     paths = (joints[..., list(WRISTS), :] - joints[..., list(SHOULDERS), :])[..., 1:]
     settled = paths[:, SETTLED:]
@@ -136,10 +102,7 @@ def _paths(states: Tensor) -> Tensor:
 
 
 def arm_rotation(states: Tensor) -> Tensor:
-    """Rotation of each arm about the centre of its wrist's path, from the side: degrees ``(sample, side)``.
-
-    Opposite rotations cancel.
-    """
+    """Rotation of each arm about the centre of its wrist's path, from the side: degrees ``(sample, side)``; opposites cancel."""
     paths = _paths(states)
     angles = torch.atan2(paths[..., 1], paths[..., 0])
     steps = torch.remainder(torch.diff(angles, dim=1) + torch.pi, 2 * torch.pi) - torch.pi
@@ -150,8 +113,7 @@ def arm_circle(states: Tensor) -> Tensor:
     """Whether upright arms rotate by :data:`TURN` on round paths: ``(sample,)`` of bool."""
     paths = _paths(states)[:, SETTLED:].transpose(1, 2)
     size = torch.linalg.svdvals(paths - paths.mean(dim=-2, keepdim=True))  # (sample, side, 2)
-    frames = states.shape[1] - SETTLED
-    width = 8**0.5 * size / frames**0.5  # diameter of a circle
+    width = 8**0.5 * size / (states.shape[1] - SETTLED) ** 0.5  # diameter of a circle
     wide = (width[..., 1] >= WIDTH) & (size[..., 1] >= ROUND * size[..., 0])
     turned = arm_rotation(states)
     return calm(states) & upright(states) & (wide & (turned >= TURN * 2 / 3)).all(dim=-1) & (turned.mean(dim=-1) >= TURN)
@@ -182,10 +144,8 @@ RULES: Mapping[str, Callable[[Tensor], Tensor]] = {
 }
 """Rules of actions by goal, from windows ``(sample, frame, 42)`` to ``(sample,)`` of bool."""
 
-
-ENOUGH = 500
-"""Windows per side above which distances of distributions depend more on motion than on the number of windows."""
-_RIGID = [BONES.index(bone) for bone in RIGID]
+ENOUGH = 500  # Windows per side above which distances of distributions depend more on motion than on the number of windows
+_RIGID = [skeleton.BONES.index(bone) for bone in skeleton.RIGID]
 
 
 def recognised(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
@@ -200,20 +160,12 @@ def _first(states: Tensor, starts: InitialStates | None) -> Tensor:
 
 def bone_error(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
     """Mean relative difference of rigid bone lengths from those of the initial pose: ``(sample,)``; 0 for recordings."""
-    usual = bone_lengths(_first(states, starts))[:, None, _RIGID]
-    return ((bone_lengths(states)[..., _RIGID] - usual).abs() / usual.clamp_min(1e-3)).mean(dim=(1, 2))
-
-
-def jerk(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
-    """Mean jerk: ``(sample,)``, see :func:`~ftl_lightning.domains.mocap.measures.mean_jerk`."""
-    return mean_jerk(states)
+    usual = skeleton.bone_lengths(_first(states, starts))[:, None, _RIGID]
+    return ((skeleton.bone_lengths(states)[..., _RIGID] - usual).abs() / usual.clamp_min(1e-3)).mean(dim=(1, 2))
 
 
 def rise(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
-    """Whether both wrists rise from below their shoulders to above them: ``(sample,)`` of bool.
-
-    From raised arms, they have to come down and rise again; no initial pose suffices by itself.
-    """
+    """Whether both wrists rise from below their shoulders to above them, whatever the initial pose: ``(sample,)`` of bool."""
     joints = as_joints(states)
     above = joints[..., list(WRISTS), 2] - joints[..., list(SHOULDERS), 2]
     low, high = (above < 0).all(dim=-1), (above > 0).all(dim=-1)
@@ -252,20 +204,13 @@ degrees_turned = _limited("arm circle", lambda states: arm_rotation(states).mean
 
 
 def distances(generated: Tensor, real: Tensor, seed: int, judge: Judge | None = None) -> dict[str, float]:
-    """Frechet and kernel distance of two sets of windows in the judge's features, at equal numbers.
+    """Frechet and kernel distance of two sets of windows ``(sample, 32, 42)`` in the features of the judge, by default the shipped.
 
-    The Frechet distance falls with the number of windows even for equal distributions: compare only rows of equal number, and add a
-    row of real against real motion. The kernel distance has no such bias.
-
-    Args:
-        generated, real: windows ``(sample, 32, 42)``; a random subset of the larger set is compared.
-        seed, judge: seed of the subset, and source of features, by default the shipped judge.
+    The Frechet distance falls with the number of windows even for equal distributions: compare only rows of equal number. A random
+    subset of the larger set, by ``seed``, is compared. A ``UserError`` for a side of fewer than two windows.
 
     Returns:
         ``fid``, ``kid`` (times 1,000), and ``number`` of windows per side; below :data:`ENOUGH` the Frechet distance means little.
-
-    Raises:
-        UserError: for a side of fewer than two windows.
     """
     judge = judge or shipped_judge()
     number = min(len(generated), len(real))
@@ -295,21 +240,13 @@ def _mean_distance(features: Tensor, pairs: int, draw: torch.Generator) -> Tenso
 
 
 def diversity(states: Tensor, seed: int, pairs: int = 200, judge: Judge | None = None) -> float:
-    """Mean distance of random pairs of windows ``(sample, 32, 42)`` in the judge's features.
-
-    Raises:
-        UserError: for fewer than two windows.
-    """
+    """Mean distance of random pairs of windows ``(sample, 32, 42)`` in the judge's features; a ``UserError`` for fewer than two."""
     require(len(states) > 1, "diversity of motion", "two windows or more", len(states))
     return float(_mean_distance((judge or shipped_judge())(states), pairs, torch.Generator().manual_seed(seed)))
 
 
 def multimodality(states: Mapping[str, Tensor], seed: int, pairs: int = 20, judge: Judge | None = None) -> float:
-    """Mean over goals of :func:`diversity` within a goal; goals of fewer than two windows are omitted.
-
-    Raises:
-        UserError: if no goal has two windows.
-    """
+    """Mean over goals of :func:`diversity` within a goal, for goals of two windows or more; a ``UserError`` if there is none."""
     draw, judge = torch.Generator().manual_seed(seed), judge or shipped_judge()
     means = [_mean_distance(judge(windows), pairs, draw) for windows in states.values() if len(windows) > 1]
     require(means, "multimodality of motion", "two windows or more of some goal", "none")
@@ -317,13 +254,9 @@ def multimodality(states: Mapping[str, Tensor], seed: int, pairs: int = 20, judg
 
 
 def learned_elsewhere(generated: Mapping[str, Tensor], real: Mapping[str, Tensor]) -> float:
-    """Balanced accuracy on real windows of a linear classifier trained on generated windows.
+    """Balanced accuracy on real windows of a linear classifier trained on generated windows ``(sample, 32, 42)`` by class.
 
-    Args:
-        generated, real: windows ``(sample, 32, 42)`` by class, of the same classes.
-
-    Raises:
-        UserError: for different classes, or fewer than two; without scikit-learn.
+    A ``UserError`` for different classes, or fewer than two; without scikit-learn.
     """
     check_extra("mocap", "learned_elsewhere")
     from sklearn.linear_model import LogisticRegression  # a second to import
@@ -332,11 +265,10 @@ def learned_elsewhere(generated: Mapping[str, Tensor], real: Mapping[str, Tensor
     same = names == sorted(real) and len(names) > 1
     both = f"{', '.join(names)} and {', '.join(sorted(real))}"
     require(same, "train on generated, test on real", "the same two classes or more", both)
-    joints = PARTS[WHOLE][0]
 
     def numbers(windows: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
         labels = torch.arange(len(names)).repeat_interleave(torch.tensor([len(windows[name]) for name in names]))
-        return extremes(torch.cat([windows[name] for name in names]), joints), labels
+        return extremes(torch.cat([windows[name] for name in names]), PARTS[WHOLE][0]), labels
 
     (inputs, labels), (tested, right) = numbers(generated), numbers(real)
     mean, std = inputs.mean(dim=0), inputs.std(dim=0).clamp_min(0.02)

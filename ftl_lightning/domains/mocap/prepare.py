@@ -14,22 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ftl_lightning.data.demonstrations import Demonstrations
+from ftl_lightning.domains.mocap import source
 from ftl_lightning.domains.mocap.asf_amc import read_amc, read_asf
 from ftl_lightning.domains.mocap.bvh import CONVERTED, EXPORTED, converted, read_bvh, read_motion
 from ftl_lightning.domains.mocap.skeleton import FPS, HIPS, HORIZON, RIGID, Poses, normalised, z_up
-from ftl_lightning.domains.mocap.source import (
-    FILE,
-    FILES,
-    THANKS,
-    WHERE,
-    Recordings,
-    glitches,
-    moving,
-    pieces,
-    training_pieces,
-    unused_reason,
-    validation_trials,
-)
+from ftl_lightning.domains.mocap.source import FILE, FILES, THANKS, WHERE, Recordings, pieces
 from ftl_lightning.domains.mocap.tasks import HELD_OUT, SEGMENTS, TRAINING_CONCEPTS, cleaned, read_segments
 from ftl_lightning.services.errors import UserError, require, short
 from ftl_lightning.services.files import MOST_TEXT, check_readable
@@ -38,25 +27,17 @@ from ftl_lightning.services.tensor_file import write_text
 from ftl_lightning.services.text import counted
 
 REPORT = "recordings.json"
-LEFT_OUT = "left out of pretraining"
-"""Key of the report: trials that are kept, but excluded from pretraining."""
+LEFT_OUT = "left out of pretraining"  # Key of the report: trials that are kept, but excluded from pretraining
 INDEXES = ("cmu-mocap-index.csv", "cmu-mocap-index-text.txt")
-"""Names of B. Hahne's index of descriptions, as a spreadsheet or as text; the first existing file is read."""
+"""B. Hahne's index of descriptions, as a spreadsheet or as text; the first existing file is read."""
 SLOW = ("60", "61", "75", "87", "88", "89")
 """Subjects recorded at 60 frames per second, others at 120 (jutanke/mocap); AMC files do not state it."""
-MIN_RAW_FRAMES = 128
-"""Minimum frames of a trial before subsampling."""
-MAX_SPREAD = 1e-3
-"""Maximum range in metres of the length of a bone within a trial."""
-FLOOR = 0.05
-"""Metres: initial frames with lower hips have no root yet."""
+MIN_RAW_FRAMES = 128  # Minimum frames of a trial before subsampling
+MAX_SPREAD = 1e-3  # Maximum range in metres of the length of a bone within a trial
+FLOOR = 0.05  # Metres: initial frames with lower hips have no root yet
 _TRIAL = re.compile(r"(\d{2,3}_\d{2,3})(?!\d)")
-EXAMPLES = 3
-"""Maximum examples printed per reason; the report has all."""
-SAME_RATE = 0.01
-"""Relative difference of frame rates that is rounding."""
-
-
+EXAMPLES = 3  # Maximum examples printed per reason; the report has all
+SAME_RATE = 0.01  # Relative difference of frame rates that is rounding
 _skeleton = functools.cache(read_asf)
 
 
@@ -95,11 +76,6 @@ class _Report:
         yield from _counted(f"dropped: {counted(len(self.dropped), 'file')}", self.dropped)
         yield from _counted(f"kept, but left out of pretraining: {counted(len(self.left_out), 'trial')}", self.left_out)
 
-    def text(self) -> str:
-        """JSON text."""
-        content = {"kept": self.kept, "dropped": self.dropped, LEFT_OUT: self.left_out, "thanks": THANKS}
-        return json.dumps(content, indent=1) + "\n"
-
 
 def _counted(what: str, trials: Mapping[str, Mapping[str, str]]) -> Iterable[str]:
     """Table of reasons, most frequent first, each with its number of trials and examples."""
@@ -114,14 +90,11 @@ def prepare(root: Path | None, out: Path | None = None) -> str:
     """Read a folder with ASF and AMC files of the database, or BVH files, at any depth, and write ``recordings.npz``.
 
     Also write ``recordings.json``: kept trials, dropped files and trials excluded from pretraining, with reasons. An existing file
-    of recordings is checked.
+    of recordings is checked. Return the text to print.
 
     Args:
         root: the folder, with B. Hahne's index of descriptions (:data:`INDEXES`), and optionally ``segments.csv``.
         out: output folder; ``None`` for ``root``.
-
-    Returns:
-        Text to print.
 
     Raises:
         UserError: if there is nothing to read, or no valid trial, with the first reason.
@@ -144,7 +117,8 @@ def prepare(root: Path | None, out: Path | None = None) -> str:
     _list(recordings, report)
     if motions or out / FILE != ready:
         recordings.save(out / FILE)
-    write_text(out / REPORT, report.text())
+    content = {"kept": report.kept, "dropped": report.dropped, LEFT_OUT: report.left_out, "thanks": THANKS}
+    write_text(out / REPORT, json.dumps(content, indent=1) + "\n")
     if segments.is_file() and out.resolve() != root.resolve():
         shutil.copyfile(segments, out / SEGMENTS)
     written = f"recordings: {out / FILE}; every trial, with its reason where it is dropped or left out: {out / REPORT}"
@@ -177,14 +151,14 @@ def _read(root: Path, motions: list[Path], report: _Report) -> Recordings:
         detail = ": ".join(text for text in (name, first["reason"], first["told"]) if text)
         raise UserError(f"{root}: expected a valid trial, found none of {len(motions)}; {detail}")
     trials = sorted(poses)
-    ends = np.cumsum([0, *(len(poses[trial][0].positions) for trial in trials)])
+    moved, kinds = zip(*(poses[trial] for trial in trials), strict=True)
     return Recordings(
-        np.concatenate([poses[trial][0].positions for trial in trials]).astype(np.float32),
-        np.concatenate([poses[trial][0].root for trial in trials]).astype(np.float32),
-        ends.astype(np.int64),
+        np.concatenate([poses.positions for poses in moved]).astype(np.float32),
+        np.concatenate([poses.root for poses in moved]).astype(np.float32),
+        np.cumsum([0, *(len(poses.root) for poses in moved)]).astype(np.int64),
         tuple(trials),
         tuple(descriptions[trial] for trial in trials),
-        tuple(poses[trial][1] for trial in trials),
+        kinds,
         tuple(trial.split("_")[0] for trial in trials),
     )
 
@@ -219,11 +193,11 @@ def _trial(path: Path, trial: str, label: str, skeletons: Mapping[str, Path]) ->
 
 def _list(recordings: Recordings, report: _Report) -> None:
     """Report kept trials, and exclusions from pretraining."""
-    training = training_pieces(recordings)
-    validation, used = validation_trials(training), {piece.trial for piece in training}
+    training = source.training_pieces(recordings)
+    validation, used = source.validation_trials(training), {piece.trial for piece in training}
     for number, trial in enumerate(recordings.trial_id):
         name, states = trial if trial not in report.kept else f"{trial} ({number})", recordings.trial(number)
-        lengths = np.diff((0, *glitches(states), len(states)))
+        lengths = np.diff((0, *source.glitches(states), len(states)))
         short = "" if number in used else f"no piece of {HORIZON} frames without glitches"
         held_out = "held out for validation" if number in validation else ""
         report.kept[name] = {
@@ -234,7 +208,7 @@ def _list(recordings: Recordings, report: _Report) -> None:
             "glitches": len(lengths) - 1,
             "too short": int(lengths[lengths < HORIZON].sum()),
         }
-        if reason := unused_reason(recordings, number) or short or held_out:
+        if reason := source.unused_reason(recordings, number) or short or held_out:
             report.left_out[name] = {"reason": reason, "told": recordings.label[number]}
 
 
@@ -246,17 +220,11 @@ def _spread(joints: NDArray[np.float64]) -> float:
 
 
 def _index(root: Path) -> dict[str, str]:
-    """Read the cleaned descriptions of trials.
-
-    Raises:
-        UserError: if there is no index, or no line of a trial.
-    """
+    """Read the cleaned descriptions of trials; raise a ``UserError`` if there is no index, or no line of a trial."""
     path = next((path for name in INDEXES for path in sorted(root.rglob(name))), None)
     if path is None:
-        raise UserError(
-            f"{root}: expected the index of descriptions, {INDEXES[0]} or {INDEXES[1]}, found neither; it comes with B. Hahne's "
-            "conversion of the database (cgspeed.com)"
-        )
+        hint = "it comes with B. Hahne's conversion of the database (cgspeed.com)"
+        raise UserError(f"{root}: expected the index of descriptions, {INDEXES[0]} or {INDEXES[1]}, found neither; {hint}")
     check_readable(path, "text", MOST_TEXT)
     lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
     rows = csv.reader(lines) if path.suffix == ".csv" else (line.split("\t") for line in lines)
@@ -266,13 +234,9 @@ def _index(root: Path) -> dict[str, str]:
 
 
 def demonstrated(path: Path) -> Demonstrations:
-    """Demonstrations from the motion of a file, without text: each a piece without glitches, as for recordings.
+    """Demonstrations, without text, from a file of ``sample --export``, at any frame rate, or of the conversion.
 
-    Args:
-        path: file of ``sample --export``, at any frame rate, or of the conversion.
-
-    Raises:
-        UserError: with the path, for a file that is damaged, of another skeleton, or shorter than a plan.
+    Each is a piece without glitches. A ``UserError`` for a file that is damaged, of another skeleton, or shorter than a plan.
     """
     motion = read_motion(path)
     if motion.names.issuperset(CONVERTED):
@@ -286,7 +250,7 @@ def demonstrated(path: Path) -> Demonstrations:
     parts = pieces(states)
     expected = f"a motion of {HORIZON} frames or more at {FPS} a second, without jumps"
     require(parts, str(path), expected, f"{len(states)} frames")
-    return moving(parts, [""] * len(parts), {"generator": "BVH file", "file": path.name})
+    return source.moving(parts, [""] * len(parts), {"generator": "BVH file", "file": path.name})
 
 
 def _at_rate(joints: NDArray[np.float64], seconds: float) -> NDArray[np.float64]:

@@ -17,34 +17,20 @@ from ftl_lightning.services.text import figure_text
 
 LEFT, RIGHT, TRUNK = "#0a6fb5", "#d9591c", "#3b3f45"
 """Colours of the person's left and right limbs and of the trunk; safe for colour blindness."""
-MAX_SAMPLES, POSES = 8, 8
-"""Maximum rows of a figure, and poses per row."""
-STEP = 1.4
-"""Distance in metres between poses; arms may reach into the next pose."""
-SOLE = 0.08
-"""Metres from an ankle down to the floor."""
-HEAD = 0.11
-"""Radius of the drawn head in metres."""
+MAX_SAMPLES, POSES = 8, 8  # Maximum rows of a figure, and poses per row
+STEP = 1.4  # Distance in metres between poses; arms may reach into the next pose
+SOLE = 0.08  # Metres from an ankle down to the floor
+HEAD = 0.11  # Radius of the drawn head in metres
 
 
-def _colour(a: int, b: int) -> str:
-    if {a, b} <= {*HIPS, *SHOULDERS, *skeleton.MIDDLE}:
-        return TRUNK
-    return RIGHT if a in skeleton.RIGHT else LEFT
-
-
-COLOURS = tuple(_colour(a, b) for a, b in BONES)
-"""Colours of the bones."""
+_TRUNK = {*HIPS, *SHOULDERS, *skeleton.MIDDLE}
+COLOURS = tuple(TRUNK if {*bone} <= _TRUNK else RIGHT if bone[0] in skeleton.RIGHT else LEFT for bone in BONES)
 
 
 def wireframe(states: Tensor) -> Wireframe:
-    """Wireframe of a motion on a floor.
+    """Wireframe of a motion ``(frame, 42)`` in metres on a floor.
 
-    States have the middle of the hips at the origin, so that the floor is unknown. In every frame it is below the lowest joint:
-    squats come down, and jumps only stretch, without leaving the floor.
-
-    Args:
-        states: ``(frame, 42)`` in metres.
+    The floor is unknown, and below the lowest joint in every frame: squats come down, and jumps only stretch.
     """
     points = np.ascontiguousarray(as_joints(states.detach().cpu()).numpy(), dtype=np.float32)
     up = np.zeros(3, dtype=np.float32)
@@ -59,13 +45,9 @@ def film(states: Tensor) -> list[NDArray[np.uint8]]:
 
 
 def picture(states: Tensor, right: Sequence[bool] | None, title: str, starts: InitialStates | None) -> Figure:
-    """Strips of poses over time from left to right, a strip per sample.
+    """Strips of poses over time from left to right, of the first :data:`MAX_SAMPLES` of ``(sample, frame, 42)`` in metres.
 
-    Args:
-        states: ``(sample, frame, 42)`` in metres; at most :data:`MAX_SAMPLES` samples are shown.
-        right: success per sample (green and red frames); ``None`` for grey frames.
-        title: title of the figure.
-        starts: initial poses, not drawn separately: plans start with them.
+    Frames show success per sample: green, red, or grey for ``None``. Plans start with the initial poses ``starts``.
     """
     shown = states[:MAX_SAMPLES]
     figure = Figure(figsize=(8.2, 1.65 * len(shown) + 0.5), layout="constrained")
@@ -96,13 +78,8 @@ def _pose(axes: Axes, points: Points, motion: Wireframe, across: float) -> None:
     depth = [float(points[a, 2] + points[b, 2]) for a, b in motion.lines]
     order = np.argsort(depth).tolist()  # nearer lines last
     at = points[:, :2] + (across, 0)
-    lines = LineCollection(
-        [at[list(motion.lines[index])] for index in order],
-        colors=[motion.colours[index] for index in order],
-        linewidths=2.0,
-        capstyle="round",
-    )
-    axes.add_collection(lines)
+    lines, colours = [at[list(motion.lines[index])] for index in order], [motion.colours[index] for index in order]
+    axes.add_collection(LineCollection(lines, colors=colours, linewidths=2.0, capstyle="round"))
     for point, radius, colour in motion.heads:
         angle = np.linspace(0, 2 * np.pi, 24)
         axes.fill(at[point, 0] + radius * np.cos(angle), at[point, 1] + radius * np.sin(angle), color=colour, linewidth=0)

@@ -1,7 +1,6 @@
-"""Body: 14 joints, bones, mirror image.
+"""Body: the 14 joints of the paper's renderer (jutanke/mocap), the last two the ends of lower neck and head.
 
-Joints are those of the paper's renderer (jutanke/mocap); the last two are the ends of lower neck and head. In every frame the
-middle of the hips is the origin, z is up, +y is where the hips face and +x the person's right.
+In every frame the middle of the hips is the origin, z is up, +y is where the hips face and +x the person's right.
 """
 
 from functools import cache
@@ -20,21 +19,16 @@ JOINTS = (
     "RHip", "RKnee", "RAnkle", "LHip", "LKnee", "LAnkle", "RShoulder", "RElbow", "RWrist", "LShoulder", "LElbow", "LWrist", "Neck",
     "HeadTop",
 )  # fmt: skip
-COLUMNS = tuple(f"{joint}.{axis}" for joint in JOINTS for axis in "xyz")
-"""Columns of a state, in metres."""
+COLUMNS = tuple(f"{joint}.{axis}" for joint in JOINTS for axis in "xyz")  # Columns of a state, in metres
 NAME = "mocap"
-POSE = "pose"
-"""Observed feature: the joints at the start of a plan, which are the plan's first state."""
+POSE = "pose"  # Observed feature: the joints at the start of a plan, which are the plan's first state
 OBSERVED = {POSE: Feature((len(COLUMNS),), state=tuple(range(len(COLUMNS))))}
-FPS = 30
-"""Frames per second."""
-HORIZON = 32
-"""Frames in a plan."""
+FPS = 30  # Frames per second
+HORIZON = 32  # Frames in a plan
 
 R_HIP, R_KNEE, R_ANKLE, L_HIP, L_KNEE, L_ANKLE, R_SHOULDER, R_ELBOW, R_WRIST, L_SHOULDER, L_ELBOW, L_WRIST, NECK, HEAD = range(14)
 RIGHT = (R_HIP, R_KNEE, R_ANKLE, R_SHOULDER, R_ELBOW, R_WRIST)
-LEFT = (L_HIP, L_KNEE, L_ANKLE, L_SHOULDER, L_ELBOW, L_WRIST)
-"""Joints of the left side, in the order of the right."""
+LEFT = (L_HIP, L_KNEE, L_ANKLE, L_SHOULDER, L_ELBOW, L_WRIST)  # Joints of the left side, in the order of the right
 MIDDLE = (NECK, HEAD)
 HIPS, SHOULDERS, WRISTS = (R_HIP, L_HIP), (R_SHOULDER, L_SHOULDER), (R_WRIST, L_WRIST)
 KNEES, ANKLES, ELBOWS = (R_KNEE, L_KNEE), (R_ANKLE, L_ANKLE), (R_ELBOW, L_ELBOW)
@@ -48,19 +42,14 @@ BONES = (
 RIGID = ((0, 1), (1, 2), (0, 3), (3, 4), (4, 5), (6, 7), (7, 8), (9, 10), (10, 11))
 """Lines of :data:`BONES` that are single bones of the skeleton, of constant length."""
 
-MIRROR = (3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8, 12, 13)
-"""Source of each joint in the mirror image."""
+MIRROR = (3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8, 12, 13)  # Source of each joint in the mirror image
 
 
 def _columns(*joints: int) -> tuple[int, ...]:
     return tuple(3 * joint + axis for joint in sorted(joints) for axis in range(3))
 
 
-GROUPS = {
-    "arms": _columns(*ELBOWS, *WRISTS),
-    "legs": _columns(*HIPS, *KNEES, *ANKLES),
-    "trunk": _columns(*SHOULDERS, *MIDDLE),
-}
+GROUPS = {"arms": _columns(*ELBOWS, *WRISTS), "legs": _columns(*HIPS, *KNEES, *ANKLES), "trunk": _columns(*SHOULDERS, *MIDDLE)}
 """Columns of each part of the body; each column belongs to a single part."""
 
 
@@ -83,15 +72,10 @@ def bone_lengths(states: Tensor) -> Tensor:
 
 
 class Poses(NamedTuple):
-    """Poses and removed root motion.
+    """Poses and removed root motion."""
 
-    Attributes:
-        positions: ``(frame, 14, 3)`` in metres, z up, the middle of the hips at the origin, hips facing +y.
-        root: ``(frame, 4)``: middle of the hips in metres, and yaw in radians.
-    """
-
-    positions: NDArray[np.float64]
-    root: NDArray[np.float64]
+    positions: NDArray[np.float64]  # (frame, 14, 3) in metres, z up, the middle of the hips at the origin, hips facing +y
+    root: NDArray[np.float64]  # (frame, 4): middle of the hips in metres, and yaw in radians
 
     @property
     def states(self) -> NDArray[np.float32]:
@@ -118,22 +102,12 @@ def normalised(joints: NDArray[np.float64]) -> Poses:
     return Poses(turned, np.concatenate((middle, yaw[:, None]), axis=1))
 
 
-_RIGHT_SIDE = (
-    (0.09, 0.0, 0.0),
-    (0.09, 0.02, -0.40),
-    (0.09, -0.03, -0.83),
-    (0.18, 0.01, 0.51),
-    (0.21, -0.04, 0.22),
-    (0.22, 0.03, 0.05),
-)
-"""Hip, knee, ankle, shoulder, elbow, wrist in metres, of an adult of medium size."""
+_RIGHT_LEG = ((0.09, 0.0, 0.0), (0.09, 0.02, -0.40), (0.09, -0.03, -0.83))  # hip, knee and ankle in metres, of a medium adult
+_RIGHT_ARM = ((0.18, 0.01, 0.51), (0.21, -0.04, 0.22), (0.22, 0.03, 0.05))  # shoulder, elbow and wrist
 _MIDDLE = ((0.0, 0.02, 0.55), (0.0, 0.07, 0.73))
-STRIDE = 0.4
-"""Maximum angle in radians of a leg forwards or back."""
-SWING = 0.8
-"""Swing of the arm relative to the leg of the same side, in the opposite direction."""
-BEND = 0.15
-"""Radians by which thighs point further forwards, and shanks further back."""
+STRIDE = 0.4  # Maximum angle in radians of a leg forwards or back
+SWING = 0.8  # Swing of the arm relative to the leg of the same side, in the opposite direction
+BEND = 0.15  # Radians by which thighs point further forwards, and shanks further back
 
 BEGINNINGS = "distribution of poses"
 _FILE = Path(__file__).parent / "beginnings.safetensors"
@@ -141,7 +115,7 @@ _FILE = Path(__file__).parent / "beginnings.safetensors"
 
 def standing_poses(count: int, draw: torch.Generator) -> Tensor:
     """Standing poses ``(count, 42)`` of people of different sizes, with arms down."""
-    right = torch.tensor(_RIGHT_SIDE)
+    right = torch.tensor((*_RIGHT_LEG, *_RIGHT_ARM))
     left = right * torch.tensor((-1.0, 1.0, 1.0))
     body = torch.cat((right[:3], left[:3], right[3:], left[3:], torch.tensor(_MIDDLE)))
     size = 1 + 0.05 * (2 * torch.rand(count, 1, 1, generator=draw) - 1)
@@ -152,8 +126,7 @@ def walking_poses(count: int, draw: torch.Generator) -> Tensor:
     """Walking poses ``(count, 42)`` of the same people, with strides from zero to the maximum."""
     joints = as_joints(standing_poses(count, draw)).clone()
     stride = STRIDE * (2 * torch.rand(count, generator=draw) - 1)
-    sides = ((R_HIP, R_SHOULDER, stride), (L_HIP, L_SHOULDER, -stride))
-    for hip, shoulder, angle in sides:  # joints of a limb are consecutive
+    for hip, shoulder, angle in ((R_HIP, R_SHOULDER, stride), (L_HIP, L_SHOULDER, -stride)):  # joints of a limb are consecutive
         _turned(joints, (hip, hip + 1, hip + 2), angle + BEND)
         _turned(joints, (hip + 1, hip + 2), -torch.full_like(angle, 2 * BEND))
         _turned(joints, (shoulder, shoulder + 1, shoulder + 2), -SWING * angle)
@@ -180,10 +153,8 @@ def fit_poses(poses: Tensor, directions: int, path: Path) -> None:
 
 def drawn_poses(count: int, draw: torch.Generator) -> Tensor:
     """Samples ``(count, 42)`` of the shipped Gaussian, in metres, on the generator's device."""
-    mean, directions = _distribution()
-    return mean.to(draw.device) + torch.randn((count, len(directions)), generator=draw, device=draw.device) @ directions.to(
-        draw.device
-    )
+    mean, directions = (value.to(draw.device) for value in _distribution())
+    return mean + torch.randn((count, len(directions)), generator=draw, device=draw.device) @ directions
 
 
 @cache

@@ -18,34 +18,9 @@ from ftl_lightning.data.demonstrations import Demonstrations, padded
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.data.formats.files import check_arrays
 from ftl_lightning.domains.domain import Split
-from ftl_lightning.domains.mocap.skeleton import (
-    ANKLES,
-    COLUMNS,
-    FPS,
-    HIPS,
-    HORIZON,
-    JOINTS,
-    NAME,
-    POSE,
-    SHOULDERS,
-    WRISTS,
-    as_joints,
-    mirrored,
-    standing_poses,
-    walking_poses,
-)
-from ftl_lightning.domains.mocap.tasks import (
-    DEMONSTRATORS,
-    HELD_OUT,
-    NEW_CONCEPTS,
-    SEGMENTS,
-    SHIPPED,
-    TRAINING_CONCEPTS,
-    Segment,
-    cleaned,
-    mirrored_text,
-    read_segments,
-)
+from ftl_lightning.domains.mocap import skeleton, tasks
+from ftl_lightning.domains.mocap.skeleton import COLUMNS, FPS, HORIZON, JOINTS, NAME, POSE, mirrored
+from ftl_lightning.domains.mocap.tasks import DEMONSTRATORS, TRAINING_CONCEPTS, Segment
 from ftl_lightning.services.errors import UserError, require, short
 from ftl_lightning.services.files import check_readable
 from ftl_lightning.services.randomness import generator, task_key
@@ -66,23 +41,15 @@ THANKS = (
 
 @dataclass(frozen=True)
 class Recordings:
-    """Concatenated trials.
+    """Concatenated trials."""
 
-    Attributes:
-        positions: ``(frame, 14, 3)`` in metres, see :mod:`ftl_lightning.domains.mocap.skeleton`.
-        root: ``(frame, 4)``: middle of the hips (x, y, z in metres) and yaw in radians.
-        offsets: ``(trial + 1,)``: trial i has the frames ``offsets[i]:offsets[i + 1]``.
-        trial_id, label, kind, subject: of each trial: such as ``13_29``; cleaned description; source format, such as ``asf_amc``;
-            such as ``13``.
-    """
-
-    positions: NDArray[np.float32]
-    root: NDArray[np.float32]
-    offsets: NDArray[np.int64]
-    trial_id: tuple[str, ...]
-    label: tuple[str, ...]
-    kind: tuple[str, ...]
-    subject: tuple[str, ...]
+    positions: NDArray[np.float32]  # (frame, 14, 3) in metres, see skeleton
+    root: NDArray[np.float32]  # (frame, 4): middle of the hips (x, y, z in metres) and yaw in radians
+    offsets: NDArray[np.int64]  # (trial + 1,): trial i has the frames offsets[i]:offsets[i + 1]
+    trial_id: tuple[str, ...]  # such as 13_29
+    label: tuple[str, ...]  # cleaned descriptions
+    kind: tuple[str, ...]  # source formats, such as asf_amc
+    subject: tuple[str, ...]  # such as 13
 
     def __len__(self) -> int:
         return len(self.trial_id)
@@ -99,11 +66,7 @@ class Recordings:
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Read recordings.
-
-        Raises:
-            UserError: with path and key, for a file that is damaged or of other content.
-        """
+        """Read recordings; raise a ``UserError`` with path and key for a file that is damaged or of other content."""
         size = check_readable(path, "recordings")
         try:
             check_arrays(path, size)
@@ -118,7 +81,7 @@ class Recordings:
             np.ascontiguousarray(arrays["positions"], dtype=np.float32),
             np.ascontiguousarray(arrays["root"], dtype=np.float32),
             arrays["offsets"].astype(np.int64),
-            **texts | {"label": tuple(map(cleaned, texts["label"]))},
+            **texts | {"label": tuple(map(tasks.cleaned, texts["label"]))},
         )
 
 
@@ -129,8 +92,7 @@ _KEYS = ("positions", "root", "offsets", *_TEXTS)
 def _check(path: Path, arrays: Mapping[str, Any]) -> None:
     for key in _KEYS:
         require(key in arrays, f"{path}: key {key!r}", "it in a file of recordings", f"none; {WHERE}")
-    trials = len(arrays["trial_id"])
-    frames = len(arrays["positions"])
+    trials, frames = len(arrays["trial_id"]), len(arrays["positions"])
     shapes = {"positions": (frames, len(JOINTS), 3), "root": (frames, 4), "offsets": (trials + 1,)}
     for key, expected in (shapes | dict.fromkeys(_TEXTS, (trials,))).items():
         require(arrays[key].shape == expected, f"{path}: key {key!r}", f"shape {expected}", arrays[key].shape)
@@ -146,8 +108,7 @@ def _check(path: Path, arrays: Mapping[str, Any]) -> None:
 def read_folder(root: Path | None) -> tuple[Recordings, tuple[Segment, ...]]:
     """Recordings of a folder, and the segments of single actions: the folder's ``segments.csv``, else the shipped segments.
 
-    Raises:
-        UserError: for a missing folder, missing recordings, or damaged recordings.
+    Raise a ``UserError`` for a missing folder, missing recordings, or damaged recordings.
     """
     if root is None:
         raise UserError(f"data.root: expected a folder of recordings, found none; {WHERE}")
@@ -156,22 +117,17 @@ def read_folder(root: Path | None) -> tuple[Recordings, tuple[Segment, ...]]:
     path = next((root / name for name in FILES if (root / name).is_file()), None)
     if path is None:
         raise UserError(f"{root}: expected {FILE}, found {'other files' if any(root.iterdir()) else 'an empty folder'}; {WHERE}")
-    segments = root / SEGMENTS
-    return Recordings.load(path), read_segments(segments if segments.is_file() else SHIPPED)
+    segments = root / tasks.SEGMENTS
+    return Recordings.load(path), tasks.read_segments(segments if segments.is_file() else tasks.SHIPPED)
 
 
 MAX_SPEED = 12.0
 """Maximum joint speed in metres per second. Faster frames are glitches, or hips without defined yaw; trials are cut there."""
-LONGEST = 128
-"""Maximum frames of a piece; parts of longer pieces overlap by a window less a frame, so that no window is lost."""
-OTHER_FIGURES = ("bvh_daz",)
-"""Excluded kinds of recordings: all subjects retargeted to the same figure."""
-CYCLE = 8
-"""Frames; periodic motion has at least twice as many per period."""
-ARMS_DOWN = 0.4
-"""Maximum distance in metres from wrist to hip, sideways and vertical, of hanging arms."""
-UPRIGHT = 0.35
-"""Minimum height in metres of shoulders above hips; half the minimum height of hips above ankles."""
+LONGEST = 128  # Maximum frames of a piece; parts of longer pieces overlap by a window less a frame, so that no window is lost
+OTHER_FIGURES = ("bvh_daz",)  # Excluded kinds of recordings: all subjects retargeted to the same figure
+CYCLE = 8  # Frames; periodic motion has at least twice as many per period
+ARMS_DOWN = 0.4  # Maximum distance in metres from wrist to hip, sideways and vertical, of hanging arms
+UPRIGHT = 0.35  # Minimum height in metres of shoulders above hips; half the minimum height of hips above ankles
 
 
 def moving(motions: Sequence[Tensor], concepts: Sequence[str], provenance: Mapping[str, object]) -> Demonstrations:
@@ -219,20 +175,15 @@ class Recorded:
         return read_folder(self.root)[1]
 
     def split(self, name: Split, count: int, seed: int) -> Demonstrations:
-        """All pieces of trials of the training concepts, and in ``'train'`` their mirror images.
+        """All pieces of trials of the training concepts, and in ``train`` their mirror images; ``count`` and ``seed`` are unused.
 
-        The recordings determine the number; ``count`` and ``seed`` are ignored. Concepts with three trials or more hold out whole
-        trials for validation: the last, the eleventh last and so on. A mirror image has the description with left and right
-        exchanged, and is omitted if this is no training concept.
-
-        Raises:
-            UserError: if the folder has no trial for the split.
+        See :func:`validation_trials`. A mirror image has the description with left and right exchanged, and is omitted if this is
+        no training concept. A ``UserError`` if the folder has no trial for the split.
         """
         wanted = [piece for piece in self._pieces if (piece.trial in self._validation) == (name == "validation")]
-        expected = f"trials of the training concepts for {name}"
-        require(wanted, str(self.root), expected, "none; use more of the database")
+        require(wanted, str(self.root), f"trials of the training concepts for {name}", "none; use more of the database")
         if name == "train":
-            reflected = [Piece(piece.trial, mirrored_text(piece.concept), mirrored(piece.states)) for piece in wanted]
+            reflected = [Piece(piece.trial, tasks.mirrored_text(piece.concept), mirrored(piece.states)) for piece in wanted]
             wanted += [piece for piece in reflected if piece.concept in TRAINING_CONCEPTS]
         return self._demonstrations(wanted, {"split": name})
 
@@ -240,12 +191,10 @@ class Recorded:
         """Demonstrations of a concept, without replacement if there are enough.
 
         For a new concept, windows as long as a plan, each from a pose nearest to standing at rest, which aligns them in time. If
-        there are too few, windows from random frames follow. For a training concept, pieces of its trials.
-
-        Raises:
-            UserError: if no trial of the folder shows the concept.
+        there are too few, windows from random frames follow. For a training concept, pieces of its trials. A ``UserError`` if no
+        trial of the folder shows the concept.
         """
-        new = task in NEW_CONCEPTS
+        new = task in tasks.NEW_CONCEPTS
         shown = self._shown(task) if new else [piece for piece in self._pieces if piece.concept == task]
         require(shown, "task", f"a concept that trials in {self.root} show", repr(task))
         draw = generator("cpu", seed, task_key(task))
@@ -261,14 +210,12 @@ class Recorded:
         """Initial poses, with equal probability of trials.
 
         For a training concept, poses of its trials, held out if possible. Otherwise poses of people who stand or walk with arms
-        down, in validation trials without demonstrators of new concepts. Without a folder, rule-based poses.
-
-        Raises:
-            UserError: if the folder has neither.
+        down, in validation trials without demonstrators of new concepts. Without a folder, rule-based poses. A ``UserError`` if the
+        folder has neither.
         """
         draw = generator("cpu", seed, task_key(task))
         if self.root is None:
-            return InitialStates({POSE: walking_poses(count, draw)})
+            return InitialStates({POSE: skeleton.walking_poses(count, draw)})
         trials = self._passed(task) or self.arms_down
         which = torch.randint(len(trials), (count,), generator=draw).tolist()
         share = torch.rand(count, generator=draw).tolist()
@@ -277,11 +224,7 @@ class Recorded:
 
     @cached_property
     def arms_down(self) -> tuple[Tensor, ...]:
-        """Poses with arms down ``(pose, 42)`` of each validation trial that has any, for :meth:`starts`.
-
-        Raises:
-            UserError: if there is none.
-        """
+        """Poses with arms down ``(pose, 42)`` of each validation trial that has any, for :meth:`starts`; else a ``UserError``."""
         subjects = self.recordings.subject
         trials = [trial for trial in sorted(self._validation) if subjects[trial] not in DEMONSTRATORS]
         poses = [torch.from_numpy(self.recordings.trial(trial)) for trial in trials]
@@ -328,7 +271,7 @@ class Recorded:
 
 def unused_reason(recordings: Recordings, trial: int) -> str:
     """Reason why a trial is in neither training nor validation; empty if it is in either."""
-    if recordings.trial_id[trial] in HELD_OUT:
+    if recordings.trial_id[trial] in tasks.HELD_OUT:
         return "held out whole, as it shows a new concept"
     if recordings.label[trial] not in TRAINING_CONCEPTS:
         return "description that is no training concept"
@@ -373,7 +316,7 @@ def glitches(states: NDArray[np.float32]) -> list[int]:
 
 def at_rest(states: Tensor) -> list[int]:
     """Start frames of windows of ``(frame, 42)``: nearest to standing within :data:`CYCLE` frames on both sides."""
-    (standing,) = standing_poses(1, generator("cpu", 0))
+    (standing,) = skeleton.standing_poses(1, generator("cpu", 0))
     far = torch.linalg.vector_norm(states - standing, dim=1)
     frames = range(len(states) - HORIZON + 1)
     return [frame for frame in frames if far[frame] == far[max(frame - CYCLE, 0) : frame + CYCLE + 1].min()]
@@ -381,7 +324,8 @@ def at_rest(states: Tensor) -> list[int]:
 
 def hang_down(poses: Tensor) -> Tensor:
     """Whether poses ``(pose, 42)`` are upright with both arms hanging down: ``(pose,)``."""
-    wrists, hips, shoulders, ankles = (as_joints(poses)[:, list(pair)] for pair in (WRISTS, HIPS, SHOULDERS, ANKLES))
+    pairs = skeleton.WRISTS, skeleton.HIPS, skeleton.SHOULDERS, skeleton.ANKLES
+    wrists, hips, shoulders, ankles = (skeleton.as_joints(poses)[:, list(pair)] for pair in pairs)
     low = (wrists[..., 2] < shoulders[..., 2] - 0.2).all(dim=1)
     near = (torch.linalg.vector_norm(wrists - hips, dim=-1) < ARMS_DOWN).all(dim=1)
     upright = (shoulders[..., 2] > UPRIGHT).all(dim=1) & (ankles[..., 2].mean(dim=1) < -2 * UPRIGHT)

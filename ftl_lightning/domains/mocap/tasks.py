@@ -1,13 +1,13 @@
 """Descriptions of motion: training concepts, new concepts learned from few demonstrations, their actions, and segments of trials.
 
-Training concepts are descriptions of trials by the database (``cmu-mocap-index.csv``, compiled by B. Hahne from mocap.cs.cmu.edu),
-as :func:`cleaned`. Pretraining excludes trials of other concepts.
+Training concepts are descriptions of trials by the database (``cmu-mocap-index.csv``, compiled by B. Hahne), as :func:`cleaned`.
 """
 
 import csv
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 
 from ftl_lightning.domains.tasks import EvaluationTask, Suite
@@ -16,26 +16,18 @@ from ftl_lightning.services.files import read_text
 
 HELD_OUT = ("13_29", "13_30", "13_31", "14_14", "14_20", "79_01", "80_71", "126_03", "126_04", "126_05")
 """Trials excluded from pretraining as a whole, since they show a new concept."""
-DEMONSTRATORS = ("13", "79", "80", "126")
-"""Subjects who demonstrate new concepts, excluded from the training of the judge."""
+DEMONSTRATORS = ("13", "79", "80", "126")  # Subjects who demonstrate new concepts, excluded from the training of the judge
 with (Path(__file__).parent / "actions.csv").open(encoding="utf-8", newline="") as _file:
     ACTION_OF: Mapping[str, str | None] = {row["description"]: row["action"] or None for row in csv.DictReader(_file)}
-"""Training concepts and their actions; ``None`` for other actions, or several in sequence.
-
-Dances are separate actions: each kind was danced by a single subject.
-"""
+"""Training concepts and their actions; ``None`` for other actions, or several in sequence."""
 TRAINING_CONCEPTS = tuple(ACTION_OF)
-PAPER_CONCEPTS = ("jumping jacks",)
-"""New concepts of the paper in most copies of the database."""
-STAND_INS = ("arm circle",)
-"""Replacements of the paper's two other new concepts."""
-DATABASE_CONCEPTS = ("chop wood", "breaststroke")
-"""New concepts of the paper in few copies of the database."""
+PAPER_CONCEPTS = ("jumping jacks",)  # New concepts of the paper in most copies of the database
+STAND_INS = ("arm circle",)  # Replacements of the paper's two other new concepts
+DATABASE_CONCEPTS = ("chop wood", "breaststroke")  # New concepts of the paper in few copies of the database
 TEST_CONCEPTS = (*PAPER_CONCEPTS, *STAND_INS)
 VALIDATION_CONCEPTS = ("knee raise", "squat")
 NEW_CONCEPTS = (*TEST_CONCEPTS, *VALIDATION_CONCEPTS, *DATABASE_CONCEPTS)
-AND = " + "
-"""Separator of the concepts of a goal."""
+AND = " + "  # Separator of the concepts of a goal
 COMPOSED_WITH = ("walk", "jump")
 _RENAMED = {"zombiewalk": "zombie walk", "heiansyodan": "heian shodan"}
 _SIDES = {"left": "right", "right": "left"}
@@ -54,42 +46,27 @@ def mirrored_text(text: str) -> str:
 
 def _new(concepts: tuple[str, ...]) -> tuple[EvaluationTask, ...]:
     """New concepts from new poses, and from initial poses of the demonstrations."""
-    return (
-        *(EvaluationTask("new concept", text, (text,)) for text in concepts),
-        *(EvaluationTask("new concept, demonstrated poses", text, (text,), initial="demonstrated") for text in concepts),
-    )
-
-
-def _pairs(concepts: tuple[str, ...]) -> list[tuple[str, str]]:
-    return [(text, second) for text in concepts for second in COMPOSED_WITH]
+    new = (EvaluationTask("new concept", text, (text,)) for text in concepts)
+    return (*new, *(EvaluationTask("new concept, demonstrated poses", text, (text,), initial="demonstrated") for text in concepts))
 
 
 def _composed(concepts: tuple[str, ...]) -> tuple[EvaluationTask, ...]:
     """Compositions with uniform weights on the whole body."""
-    return tuple(EvaluationTask("new + training", AND.join(pair), pair[:1], pair[1:]) for pair in _pairs(concepts))
+    pairs = product(concepts, COMPOSED_WITH)
+    return tuple(EvaluationTask("new + training", AND.join(pair), pair[:1], pair[1:]) for pair in pairs)
 
 
 def _by_parts(concepts: tuple[str, ...]) -> tuple[EvaluationTask, ...]:
     """Compositions of concepts on separate parts of the body."""
-    return tuple(
-        EvaluationTask(
-            "new + training, by parts of the body",
-            AND.join(pair),
-            pair[:1],
-            pair[1:],
-            on=((pair[0], ("arms", "trunk")), (pair[1], ("legs",))),
-        )
-        for pair in _pairs(concepts)
-    )
+    setting, arms, legs = "new + training, by parts of the body", ("arms", "trunk"), ("legs",)
+    composed = _composed(concepts)
+    return tuple(replace(task, setting=setting, on=((task.learned[0], arms), (task.texts[0], legs))) for task in composed)
 
 
 def _protocol(concepts: tuple[str, ...]) -> tuple[EvaluationTask, ...]:
     """Protocol of the paper: from the demonstrations' last states, alone and composed with training concepts."""
-    pairs = _pairs(concepts)
-    return (
-        *(EvaluationTask("new concept, last states", text, (text,), initial="last") for text in concepts),
-        *(EvaluationTask("new + training, last states", AND.join(pair), pair[:1], pair[1:], initial="last") for pair in pairs),
-    )
+    composed = (replace(task, setting="new + training, last states", initial="last") for task in _composed(concepts))
+    return (*(EvaluationTask("new concept, last states", text, (text,), initial="last") for text in concepts), *composed)
 
 
 SUITES = {
@@ -100,21 +77,17 @@ SUITES = {
     "database": Suite(_new(DATABASE_CONCEPTS)),
     "validation": Suite(_new(VALIDATION_CONCEPTS)),
 }
-"""``'paper'`` and ``'protocol'``, with the initial states of the paper, are for final evaluation; ``'validation'`` is for tuning.
-
-``'database'`` needs the trials of :data:`DATABASE_CONCEPTS` in the user's copy. ``'whole'`` is the part of ``'composition'`` for
-methods that cannot compose by parts of the body."""
+"""``paper`` and ``protocol``, with the initial states of the paper, are for final evaluation; ``validation`` is for tuning.
+``database`` needs :data:`DATABASE_CONCEPTS` in the user's copy; ``whole`` is for methods that cannot compose by parts."""
 
 
-OTHER = "other"
-"""No action: motions of a single person, standing people, and windows without motion (a frozen frame, trembling)."""
+OTHER = "other"  # No action: motions of a single person, standing people, and windows without motion (a frozen frame, trembling)
 
 _NAMES = (
     "walk", "run", "jump", "kick", "punch", "signals", "jumping jacks", "twist", "knee raise", "arm circle", "squat", "toe touch",
     "ballet", "basketball", "cartwheel", "charleston", "climb", "lambada", "pose", "swordplay",
 )  # fmt: skip
-CLASSES = (*_NAMES, OTHER)
-"""Classes of a judge."""
+CLASSES = (*_NAMES, OTHER)  # Classes of a judge
 
 TESTED = CLASSES[: CLASSES.index("toe touch") + 1]
 """Classes of two subjects or more, on which a judge can be tested with new people."""
@@ -123,16 +96,12 @@ _LABELS = {"jog": "run", "leg kick": "kick", "toe touch one hand": "toe touch", 
 """Labels of segments that are no training concepts."""
 _CLASS_OF = {name: name for name in _NAMES} | _LABELS | {text: name for text, name in ACTION_OF.items() if name is not None}
 
-STAND = "stand"
-"""Class of the legs in actions of arms and trunk."""
-STANDING = ("punch", "signals", "twist", "arm circle", "toe touch", "swordplay")
-"""Actions of arms and trunk."""
-STEPPING = ("walk", "run", "kick", "knee raise", "squat", "basketball")
-"""Actions of the legs, independent of the arms."""
+STAND = "stand"  # Class of the legs in actions of arms and trunk
+STANDING = ("punch", "signals", "twist", "arm circle", "toe touch", "swordplay")  # Actions of arms and trunk
+STEPPING = ("walk", "run", "kick", "knee raise", "squat", "basketball")  # Actions of the legs, independent of the arms
 REVERSIBLE = ("jumping jacks", "twist", "knee raise", "arm circle", "squat", "toe touch")
 """Periodic actions, invariant to time reversal."""
-LEG_CLASSES = (*(name for name in CLASSES if name not in STANDING), STAND)
-"""Classes of a judge of the legs."""
+LEG_CLASSES = (*(name for name in CLASSES if name not in STANDING), STAND)  # Classes of a judge of the legs
 
 
 def action(text: str) -> str | None:
@@ -167,17 +136,12 @@ class Segment:
 
     Shipped segments are from M. C. Hughes (mocap6dataset, ``truelabels``: a label per tenth of a second; subjects 13 and 14) and
     F. Zhou (aca, ``moc``: the middle value; subject 86). ``segments.csv`` in a folder of recordings replaces them.
-
-    Attributes:
-        trial_id: such as ``13_29``.
-        label: the action.
-        start, stop: frames at 30 per second, the last excluded; ``stop`` is ``None`` for the end of the trial.
     """
 
-    trial_id: str
-    label: str
-    start: int
-    stop: int | None
+    trial_id: str  # such as 13_29
+    label: str  # the action
+    start: int  # frame at 30 per second
+    stop: int | None  # frame after the last; None for the end of the trial
 
 
 WHOLE_TRIALS = tuple(
@@ -189,11 +153,7 @@ WHOLE_TRIALS = tuple(
 
 
 def read_segments(path: Path) -> tuple[Segment, ...]:
-    """Segments of a file with the columns ``trial_id,label,start30,stop30``, and :data:`WHOLE_TRIALS`.
-
-    Raises:
-        UserError: with path and line.
-    """
+    """Segments of a file with the columns ``trial_id,label,start30,stop30``, and :data:`WHOLE_TRIALS`; errors name the line."""
     try:
         lines = list(csv.reader(read_text(path, "table of segments").splitlines()))
     except csv.Error as error:

@@ -17,31 +17,9 @@ from ftl_lightning.domains.comparison import Comparison, Paper, Published
 from ftl_lightning.domains.domain import EXECUTED, Concepts, Domain, Plans, Privileged, deferred
 from ftl_lightning.domains.execution import ClosedLoop, Policy, Rollout
 from ftl_lightning.domains.pictures import Show
+from ftl_lightning.domains.tabletop import interface
 from ftl_lightning.domains.tabletop.experts import PUSH_HEIGHT
-from ftl_lightning.domains.tabletop.interface import (
-    ACTION,
-    FEATURES,
-    MAX_STEPS,
-    NAME,
-    PLACES,
-    POSE,
-    PUSH,
-    PUSH_ON_BOOK,
-    SEEN,
-    STATE_NAMES,
-    STATE_UNITS,
-    SUITES,
-    TASKS,
-    TRAINING_CONCEPTS,
-    VIEWS,
-    WIDE_CONCEPTS,
-    WIDE_NAME,
-    WIDE_SUITES,
-    check_simulator,
-    check_task,
-    misplaced,
-    told,
-)
+from ftl_lightning.domains.tabletop.interface import PUSH, PUSH_ON_BOOK, WIDE_CONCEPTS, WIDE_NAME, check_simulator
 from ftl_lightning.domains.tabletop.scenes import OBJECTS, TRIANGLE
 from ftl_lightning.services.errors import UserError
 
@@ -50,19 +28,13 @@ if TYPE_CHECKING:
     from ftl_lightning.domains.tabletop.source import Expert
 
 _LOG = logging.getLogger(__name__)
-BOOK_MOVED = 0.02
-"""Displacement in metres above which the book counts as moved."""
-HORIZON = 32
-"""States per plan, as in the paper."""
-RENDERING = "ftl_lightning.domains.tabletop.rendering"
+BOOK_MOVED = 0.02  # Displacement in metres above which the book counts as moved
+HORIZON = 32  # States per plan, as in the paper
+_FOLDER, RENDERING = Path(__file__).parent, "ftl_lightning.domains.tabletop.rendering"
 
 
 def source(root: Path | None, wide: bool = False) -> "Expert":
-    """Scripted experts; those of the wide domain have recoveries for all concepts.
-
-    Raises:
-        UserError: without the simulator.
-    """
+    """Scripted experts; those of the wide domain have recoveries for all concepts. Without the simulator, a ``UserError``."""
     check_simulator()
     from ftl_lightning.domains.tabletop.source import Expert
 
@@ -70,11 +42,7 @@ def source(root: Path | None, wide: bool = False) -> "Expert":
 
 
 def environment(ends_at: Collection[str] = (TRIANGLE,)) -> "TableTopEnvironment":
-    """Environment in which an episode ends when the circle touches any of the objects ``ends_at``.
-
-    Raises:
-        UserError: without the simulator, or if it does not start.
-    """
+    """Environment in which an episode ends when the circle touches any of ``ends_at``; a ``UserError`` without the simulator."""
     check_simulator()
     from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
 
@@ -82,11 +50,7 @@ def environment(ends_at: Collection[str] = (TRIANGLE,)) -> "TableTopEnvironment"
 
 
 def judge(goal: str, rollout: Rollout) -> dict[str, Tensor]:
-    """Judge episodes.
-
-    Returns:
-        ``(episode,)`` each: ``success``; ``book moved``, by more than :data:`BOOK_MOVED`.
-    """
+    """Judge episodes: ``success`` and ``book moved``, by more than :data:`BOOK_MOVED`, ``(episode,)`` each."""
     from ftl_lightning.domains.tabletop.environment import judged
 
     scenes = rollout.starts.require_scenes().numpy()
@@ -104,15 +68,13 @@ Make = Callable[[str, InitialStates, Demonstrations | None, int], Policy | None]
 
 
 def _replayed(tasks: tuple[str, ...], height: float | None = None, feedback: bool = True) -> Make:
-    """Policy that replays actions of an expert, recorded in a separate simulation; bitwise equal to running the expert.
+    """Policy for ``tasks`` that replays actions of an expert, recorded in a separate simulation; bitwise equal to the expert.
 
-    Args:
-        tasks: tasks with this reference.
-        height, feedback: see :func:`ftl_lightning.domains.tabletop.experts.moves`.
+    See :func:`ftl_lightning.domains.tabletop.experts.moves` for ``height`` and ``feedback``.
     """
 
     def make(goal: str, starts: InitialStates, demonstrations: Demonstrations | None, seed: int) -> Policy | None:
-        if check_task(goal) not in tasks:
+        if interface.check_task(goal) not in tasks:
             return None
         check_simulator()
         from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
@@ -129,7 +91,7 @@ def _replayed(tasks: tuple[str, ...], height: float | None = None, feedback: boo
                     raise
                 except Exception as error:  # any error of the simulator: other episodes continue
                     _LOG.warning("table-top %r, episode %d: %r; the reference policy has no action there", goal, row, error)
-                    actions.append(torch.full((1, ACTION), torch.nan))
+                    actions.append(torch.full((1, interface.ACTION), torch.nan))
                     env.close()
                     env = TableTopEnvironment()
         finally:
@@ -140,7 +102,7 @@ def _replayed(tasks: tuple[str, ...], height: float | None = None, feedback: boo
 
 
 POLICIES = {
-    "expert (oracle)": _replayed(TASKS),
+    "expert (oracle)": _replayed(interface.TASKS),
     "table-height push": _replayed((PUSH_ON_BOOK,), height=PUSH_HEIGHT),
     "straight push": _replayed((PUSH, PUSH_ON_BOOK), feedback=False),
 }
@@ -153,27 +115,23 @@ PUBLISHED = tuple(Published(setting, value, task=task, metric=EXECUTED) for sett
 _LOOP = ClosedLoop(
     environment=environment,
     act=act,
-    steps=MAX_STEPS,
+    steps=interface.MAX_STEPS,
     judge=judge,
     film=deferred(f"{RENDERING}:film"),
     vector_film=deferred(f"{RENDERING}:vector_film"),
-    keeps=(POSE,),
+    keeps=(interface.POSE,),
     less_is_better=("book moved",),
     policies=POLICIES,
     expect=check_simulator,
 )
 DOMAIN = Domain(
-    name=NAME,
-    plans=Plans(HORIZON, STATE_NAMES, STATE_UNITS, resolution=1e-4),
-    concepts=Concepts(
-        training=TRAINING_CONCEPTS,
-        suites=SUITES,
-        table=Path(__file__).parent / "embeddings.safetensors",
-    ),
+    name=interface.NAME,
+    plans=Plans(HORIZON, interface.STATE_NAMES, interface.STATE_UNITS, resolution=1e-4),
+    concepts=Concepts(interface.TRAINING_CONCEPTS, interface.SUITES, table=_FOLDER / "embeddings.safetensors"),
     source=source,
-    observed=FEATURES,
-    privileged={PLACES: Privileged(SEEN, misplaced, told)},
-    views=VIEWS,
+    observed=interface.FEATURES,
+    privileged={interface.PLACES: Privileged(interface.SEEN, interface.misplaced, interface.told)},
+    views=interface.VIEWS,
     show=Show(deferred(f"{RENDERING}:render"), vector_film=deferred(f"{RENDERING}:plan_film")),
     closed_loop=_LOOP,
     comparison=Comparison(
@@ -185,7 +143,7 @@ DOMAIN = Domain(
 WIDE = replace(
     DOMAIN,
     name=WIDE_NAME,
-    concepts=Concepts(training=WIDE_CONCEPTS, suites=WIDE_SUITES, table=Path(__file__).parent / "wide_embeddings.safetensors"),
+    concepts=Concepts(WIDE_CONCEPTS, interface.WIDE_SUITES, table=_FOLDER / "wide_embeddings.safetensors"),
     source=partial(source, wide=True),
     closed_loop=replace(_LOOP, environment=partial(environment, ends_at=OBJECTS)),
     comparison=replace(DOMAIN.comparison, paper=None),

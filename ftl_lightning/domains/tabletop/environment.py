@@ -47,25 +47,18 @@ from ftl_lightning.domains.tabletop.scenes import (
 from ftl_lightning.domains.tabletop.world import ARM, FASTEST, FINGERS, REST, TIP, Bodies, build, downward, turned
 from ftl_lightning.services.errors import UserError, require
 
-TARGETS, SUBSTEPS = 3, 8
-"""Arm targets per step, and simulation steps per target."""
-ITERATIONS = 20
-"""Maximum iterations of inverse kinematics per target."""
+TARGETS, SUBSTEPS = 3, 8  # Arm targets per step, and simulation steps per target
+ITERATIONS = 20  # Maximum iterations of inverse kinematics per target
 GAIN = 0.1
-FORCE = 20.0
-"""Force of a finger in newtons."""
-REACH = ((0.25, 0.78), (-0.36, 0.36), (0.008, 0.4))
-"""Ranges of the hand position in metres."""
-TOUCH = 0.003
-"""Maximum gap in metres between circle and triangle that counts as contact."""
+FORCE = 20.0  # Force of a finger in newtons
+REACH = ((0.25, 0.78), (-0.36, 0.36), (0.008, 0.4))  # Ranges of the hand position in metres
+TOUCH = 0.003  # Maximum gap in metres between circle and triangle that counts as contact
 LIFTED, AWAY, STILL = 0.02, 0.05, 0.001
 """Thresholds in metres: rise of a lifted circle; height of the open hand above a released circle, and the circle's maximum movement
 per step."""
-RECYCLE = 200
-"""Scenes after which the simulator is restarted, since it leaks memory."""
+RECYCLE = 200  # Scenes after which the simulator is restarted, since it leaks memory
 
-Seen = dict[str, NDArray[Any]]
-"""Observed features by name."""
+Seen = dict[str, NDArray[Any]]  # Observed features by name
 
 
 class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
@@ -74,7 +67,7 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
     Observations are :data:`FEATURES`. An action is the target position of the hand in 0.1 s and the gripper opening; the hand
     points down with constant yaw. An episode is a function of scene and actions alone. It ends when the circle touches the
     triangle or is released, and after :data:`MAX_STEPS` steps; the simulation can continue. Every instance has a separate
-    simulator, without display.
+    simulator, without display; a ``UserError`` if it does not start.
 
     Keys of the info: positions of ``circle``, ``triangle`` and book (``book place``), ``None`` for absent objects; displacement of
     the ``book`` in metres; whether the circle ``touched`` the triangle, and names of all touched objects (``touches``); whether
@@ -83,23 +76,14 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
     Args:
         arm_drawn: whether images show the arm, which hides much of the table from above.
         ends_at: objects whose contact with the circle ends an episode.
-
-    Raises:
-        UserError: if the simulator does not start.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": HERTZ}  # noqa: RUF012 (gymnasium's)
     render_mode = "rgb_array"
-    observation_space: gymnasium.spaces.Space[Any] = gymnasium.spaces.Dict(
-        {
-            IMAGE: gymnasium.spaces.Box(0, 255, FEATURES[IMAGE].shape, np.uint8),
-            POSE: gymnasium.spaces.Box(-np.inf, np.inf, FEATURES[POSE].shape, np.float32),
-        }
-    )
-    action_space = gymnasium.spaces.Box(
-        np.array([*(low for low, _ in REACH), 0.0], dtype=np.float32),
-        np.array([*(high for _, high in REACH), OPEN], dtype=np.float32),
-    )
+    _image = gymnasium.spaces.Box(0, 255, FEATURES[IMAGE].shape, np.uint8)
+    _pose = gymnasium.spaces.Box(-np.inf, np.inf, FEATURES[POSE].shape, np.float32)
+    observation_space: gymnasium.spaces.Space[Any] = gymnasium.spaces.Dict({IMAGE: _image, POSE: _pose})
+    action_space = gymnasium.spaces.Box(*np.array([*REACH, (0.0, OPEN)], dtype=np.float32).T)
 
     def __init__(self, arm_drawn: bool = False, ends_at: Collection[str] = (TRIANGLE,)) -> None:
         self.arm_drawn, self.ends_at = arm_drawn, frozenset(ends_at)
@@ -118,19 +102,15 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
             raise UserError(f"table-top: the physics simulator does not start ({error}); close some of its instances") from error
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Seen, dict[str, Any]]:
-        """Build a scene.
+        """Build a scene; raise a ``UserError`` for an invalid scene, see :func:`~ftl_lightning.domains.tabletop.scenes.check`.
 
         Args:
             seed: seed of a drawn scene.
             options: ``scene``, 24 numbers; or ``task``, whose scene is drawn (default 'push green circle to orange triangle').
-
-        Raises:
-            UserError: for an invalid scene, see :func:`~ftl_lightning.domains.tabletop.scenes.check`.
         """
         super().reset(seed=seed)
-        options = options or {}
-        if (given := options.get("scene")) is None:
-            given = draw_scene(check_task(options.get("task", PUSH)), self.np_random)
+        if (given := (options or {}).get("scene")) is None:
+            given = draw_scene(check_task((options or {}).get("task", PUSH)), self.np_random)
         self.scene = check(given).copy()
         if self._built == RECYCLE:
             self.client.disconnect()
@@ -152,11 +132,8 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
 
     def _angles(self, place: NDArray[np.float64]) -> list[float]:
         """Joint angles of a hand position, by inverse kinematics."""
-        robot, turn = self.bodies.robot, downward(float(self.scene[HAND][3]))
-        solution = self.client.calculateInverseKinematics(
-            robot, TIP, place.tolist(), turn, maxNumIterations=ITERATIONS, residualThreshold=1e-5
-        )
-        return list(solution[: len(ARM)])
+        turn, limits = downward(float(self.scene[HAND][3])), {"maxNumIterations": ITERATIONS, "residualThreshold": 1e-5}
+        return list(self.client.calculateInverseKinematics(self.bodies.robot, TIP, place.tolist(), turn, **limits)[: len(ARM)])
 
     def step(self, action: NDArray[np.float32]) -> tuple[Seen, float, bool, bool, dict[str, Any]]:
         """Move for 0.1 s. The reward is 0: success depends on the task, which the environment does not know."""
@@ -168,19 +145,11 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         way *= min(1.0, FASTEST / max(float(np.linalg.norm(way)), 1e-9))
         opening = OPEN if values[3] > THRESHOLD else 0.0
         self.command = np.array([*(before + way), opening])
-        robot = self.bodies.robot
-        self.client.setJointMotorControlArray(
-            robot, FINGERS, pybullet().POSITION_CONTROL, targetPositions=[opening / 2] * 2, forces=[FORCE] * 2
-        )
+        robot, mode, drive = self.bodies.robot, pybullet().POSITION_CONTROL, self.client.setJointMotorControlArray
+        drive(robot, FINGERS, mode, targetPositions=[opening / 2] * 2, forces=[FORCE] * 2)
+        strength = {"forces": [87.0] * 4 + [12.0] * 3, "positionGains": [GAIN] * len(ARM)}
         for part in range(1, TARGETS + 1):
-            self.client.setJointMotorControlArray(
-                robot,
-                ARM,
-                pybullet().POSITION_CONTROL,
-                targetPositions=self._angles(before + way * part / TARGETS),
-                forces=[87.0] * 4 + [12.0] * 3,
-                positionGains=[GAIN] * len(ARM),
-            )
+            drive(robot, ARM, mode, targetPositions=self._angles(before + way * part / TARGETS), **strength)
             for _ in range(SUBSTEPS):
                 self.client.stepSimulation()
         self._steps += 1
@@ -208,9 +177,8 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
 
     def put(self, hand: NDArray[np.float64], circle: NDArray[np.float64], opening: float = 0.0) -> Seen:
         """Start an episode with given hand position ``(3,)``, opening, and circle centre ``(2,)``; return the observation."""
-        self.client.resetBasePositionAndOrientation(
-            self.bodies.objects[CIRCLE], [*map(float, circle), self._first[CIRCLE][2]], turned(0.0)
-        )
+        place = [*map(float, circle), self._first[CIRCLE][2]]
+        self.client.resetBasePositionAndOrientation(self.bodies.objects[CIRCLE], place, turned(0.0))
         self._place(hand, opening)
         return self.begun()
 
@@ -247,9 +215,7 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
     def _info(self) -> dict[str, Any]:
         places, hand = self.places(), self.hand()
         circle = places[CIRCLE]
-        released = bool(
-            hand[7] > THRESHOLD and hand[2] > circle[2] + AWAY and np.linalg.norm(circle - self._before) < STILL and self._steps
-        )
+        left = hand[7] > THRESHOLD and hand[2] > circle[2] + AWAY
         moved = float(np.linalg.norm(places[BOOK] - self._first[BOOK])) if BOOK in places else 0.0
         return {
             "circle": circle,
@@ -259,7 +225,7 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
             "touched": TRIANGLE in self._touched,
             "touches": frozenset(self._touched),
             "lifted": self._lifted,
-            "released": released,
+            "released": bool(left and np.linalg.norm(circle - self._before) < STILL and self._steps),
             "trace": self._trace,
         }
 
@@ -291,10 +257,8 @@ def touching(shape: NDArray[np.float64], circle: NDArray[np.float64]) -> bool:
     return gap(outline(CIRCLE, float(circle[0]), float(circle[1]), 0.0), shape) <= TOUCH
 
 
-LEVEL = 0.008
-"""Tolerance in metres of the circle's height on a surface."""
-NEAR = 0.15
-"""Maximum centre distance in metres between the circle and the object beside it."""
+LEVEL = 0.008  # Tolerance in metres of the circle's height on a surface
+NEAR = 0.15  # Maximum centre distance in metres between the circle and the object beside it
 
 
 def judged(task: str, scene: NDArray[np.float32], info: Mapping[str, Any]) -> bool:
@@ -324,9 +288,8 @@ def judged(task: str, scene: NDArray[np.float32], info: Mapping[str, Any]) -> bo
         return _lies(circle, 0.0) and float(np.linalg.norm(circle[:2] - thing[:2])) <= NEAR
     name = BOOK if task == TO_BOOK else WHITE
     x, y, yaw = map(float, scene[COLUMNS[name]][1:])
-    moved = info["book place"] if task == TO_BOOK else None
-    if moved is not None:
-        x, y = float(moved[0]), float(moved[1])
+    if task == TO_BOOK and info["book place"] is not None:
+        x, y = map(float, info["book place"][:2])
     return _lies(circle, HEIGHT[name]) and within(circle[None, :2], outline(name, x, y, yaw))
 
 

@@ -1,7 +1,7 @@
 """Scripted experts: policies that command the next hand position from the object positions.
 
-A push is a function of the current positions alone. A low hand behind the circle pushes. Any other hand rises, travels above the
-table, and descends behind the circle. The same rule thus starts a push and restarts it when the circle has slipped away.
+A low hand behind the circle pushes. Any other hand rises, travels above the table, and descends behind the circle: the same rule
+starts a push and restarts it when the circle has slipped away.
 """
 
 import math
@@ -12,15 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ftl_lightning.domains.tabletop.interface import (
-    AROUND_BOWL,
-    MAX_STEPS,
-    OPEN,
-    PUSH_ON_BOOK,
-    PUSHES,
-    TO_BOOK,
-    TO_WHITE,
-)
+from ftl_lightning.domains.tabletop.interface import AROUND_BOWL, MAX_STEPS, OPEN, PUSH_ON_BOOK, PUSHES, TO_BOOK, TO_WHITE
 from ftl_lightning.domains.tabletop.scenes import (
     APART,
     BOOK,
@@ -42,54 +34,34 @@ if TYPE_CHECKING:
 
 Place = NDArray[np.float64]
 
-WIDEST = 0.8
-"""Maximum angle in radians of a pushing hand from the line behind the circle, seen from the circle."""
-FARTHEST = 0.12
-"""Maximum distance in metres of a pushing hand from the circle's centre."""
+WIDEST = 0.8  # Maximum angle in radians of a pushing hand from the line behind the circle, seen from the circle
+FARTHEST = 0.12  # Maximum distance in metres of a pushing hand from the circle's centre
 STEERING = 3.0
-"""Steering gain: deviation of the hand's direction from the circle's, per radian of the hand's angle. 1 moves straight to the
-circle's centre, larger values return to the line behind it."""
-LOW = 0.006
-"""Height in metres above push height below which a hand is low."""
-CLEAR = 0.065
-"""Travel height in metres above push height, above all objects."""
+"""Deviation of the hand's direction from the circle's, per radian of the hand's angle; above 1, it returns to the line behind."""
+LOW = 0.006  # Height in metres above push height below which a hand is low
+CLEAR = 0.065  # Travel height in metres above push height, above all objects
 NEAR, FUNNEL = 0.015, 0.03
-"""Distances in metres from the point of descent: radius in which the hand may be low, and width of the funnel above it. The radius
-exceeds the spread of this point between demonstrations; otherwise their mean would stay in the air."""
-ACROSS, DOWN, UP = 0.016, 0.011, 0.014
-"""Maximum metres per step sideways, down and up."""
-AHEAD = 0.05
-"""Distance in metres of the circle's next goal on the path around the bowl."""
+"""Metres from the point of descent: radius in which the hand may be low (above the spread between demonstrations), and funnel."""
+ACROSS, DOWN, UP = 0.016, 0.011, 0.014  # Maximum metres per step sideways, down and up
+AHEAD = 0.05  # Distance in metres of the circle's next goal on the path around the bowl
 
 
 @dataclass(frozen=True)
 class Manner:
-    """Style of a push.
+    """Style of a push."""
 
-    Attributes:
-        height: hand height in metres above the table.
-        speed: metres per step while pushing.
-        haste: factor of the travel speed.
-        behind, aside: start of the push in metres, behind the circle and left of the line to its goal.
-    """
-
-    height: float
-    speed: float
-    haste: float = 1.0
-    behind: float = 0.065
-    aside: float = 0.0
+    height: float  # of the hand, in metres above the table
+    speed: float  # metres per step while pushing
+    haste: float = 1.0  # factor of the travel speed
+    behind: float = 0.065  # start of the push in metres, behind the circle
+    aside: float = 0.0  # start of the push in metres, left of the line to its goal
 
 
 def pushed(hand: Place, circle: Place, goal: Place, manner: Manner) -> Place:
-    """Next hand position ``(3,)`` of a push of the circle to a goal.
+    """Next hand position ``(3,)`` of a push: ``hand (3,)``, centre of the ``circle (2,)`` and its ``goal (2,)`` in metres.
 
     For a hand at angle a behind the circle, the hand's direction differs by :data:`STEERING` times a from the circle's; a gain of 2
     is a dipole field (Igarashi et al., 2010).
-
-    Args:
-        hand: ``(3,)`` in metres.
-        circle, goal: ``(2,)``, the circle's centre and its goal in metres.
-        manner: style of the push.
     """
     along, to = complex(*(goal - circle)), complex(*(circle - hand[:2]))
     distance = abs(to)
@@ -115,10 +87,7 @@ def _travelled(hand: Place, begin: Place, manner: Manner) -> Place:
 
 
 def around(circle: Place, goal: Place, bowl: Place) -> Place:
-    """Next goal ``(2,)`` of the circle on the way around the bowl to a goal, :data:`AHEAD` along the path.
-
-    The path leads straight to the ring around the bowl, along its shorter side, and straight on.
-    """
+    """Next goal ``(2,)`` of the circle :data:`AHEAD` on the path: straight to the ring around the bowl, along its shorter side."""
     line = goal - circle
     distance = max(float(np.linalg.norm(line)), 1e-6)
     along = line / distance
@@ -143,65 +112,41 @@ def _tangent(centre: Place, place: Place, turn: float) -> float:
     return math.atan2(off[1], off[0]) - turn * math.acos(RING / distance)
 
 
-PAST = 8
-"""Steps that a push continues after success: small position errors must not stop a policy before the triangle."""
-STAY = 4
-"""Steps of rest after a task, so that plans end at rest."""
+PAST = 8  # Steps that a push continues after success: small position errors must not stop a policy before the triangle
+STAY = 4  # Steps of rest after a task, so that plans end at rest
 CLOSED = 0.0
-PUSH_HEIGHT = 0.014
-"""Hand height in metres above the surface under the circle during a push."""
+PUSH_HEIGHT = 0.014  # Hand height in metres above the surface under the circle during a push
 GRASP_HEIGHT = 0.016
-ASIDE = 0.006
-"""Maximum lateral offset in metres at the start of a push."""
-SPEED = 0.008
-"""Push speed in metres per step."""
-SLOWER = 1.4
-"""Speed divisor of pushes on the book, which adds time steps to learn from."""
+ASIDE = 0.006  # Maximum lateral offset in metres at the start of a push
+SPEED = 0.008  # Push speed in metres per step
+SLOWER = 1.4  # Speed divisor of pushes on the book, which adds time steps to learn from
 STRAIGHT_SPEED = 0.009
-TREMBLE = 0.0003
-"""Standard deviation of the hand noise per step, in metres."""
+TREMBLE = 0.0003  # Standard deviation of the hand noise per step, in metres
 SLIPS, SLIP = 0.04, (0.006, 0.018)
-"""Slip probability per step of a push, and range of slip sizes in metres. Recovery is learned only from demonstrations that leave
-the path (Laskey et al., 2017); constant noise would hide the path."""
-RETURN = 0.8
-"""Share of the hand's deviation from its path that remains a step later."""
-MISLAID = 0.6
-"""Recoveries: probability that the circle is moved."""
+"""Slip probability per step of a push, and range of sizes in metres: recovery is learned from slips (Laskey et al., 2017)."""
+RETURN = 0.8  # Share of the hand's deviation from its path that remains a step later
+MISLAID = 0.6  # Recoveries: probability that the circle is moved
 LYING, RISING, OVER = 0.5, 0.4, 0.03
-"""Recoveries: probability of a low hand; probability that any other hand is beside the circle; minimum height in metres above push
-height of a hand over the circle."""
-ASTRAY, REACHED = ((0.32, 0.70), (-0.28, 0.28)), ((0.26, 0.77), (-0.35, 0.35))
-"""Recoveries: x and y ranges of circle and hand."""
-OPENED, HIGHEST = 0.5, 0.16
-"""Recoveries of picks: probability of an open hand, and maximum hand height in metres above push height."""
+"""Recoveries: probability of a low hand; that any other is beside the circle; minimum metres above push height of one over it."""
+ASTRAY, REACHED = ((0.32, 0.70), (-0.28, 0.28)), ((0.26, 0.77), (-0.35, 0.35))  # Recoveries: x and y ranges of circle and hand
+OPENED, HIGHEST = 0.5, 0.16  # Recoveries of picks: probability of an open hand, and maximum hand height in metres above push height
 AROUND, ROOM, FARTHEST_PUSH = (0.034, 0.08), 0.012, 0.33
-"""Recoveries, in metres: range of the distance between hand and circle; minimum gap between the circle and other objects; maximum
-distance between the circle and the target of a push."""
-APART_FROM = 0.12
-"""Centre distance in metres between an object and the circle placed beside it; leaves room for open fingers."""
+"""Recoveries, in metres: range from hand to circle; minimum gap between circle and others; maximum from circle to push target."""
+APART_FROM = 0.12  # Centre distance in metres between an object and the circle placed beside it; leaves room for open fingers
 
-Moves = Generator[Place, None, None]
-"""Commands ``(4,)`` per step: x, y, z and gripper opening."""
+Moves = Generator[Place, None, None]  # Commands (4,) per step: x, y, z and gripper opening
 
 
 @dataclass(frozen=True)
 class Style:
-    """Variation between demonstrations, drawn once per demonstration.
+    """Variation between demonstrations, drawn once per demonstration."""
 
-    Attributes:
-        speed: factor of all speeds.
-        behind, aside: start of a push in metres, behind the circle and left of the line to its goal.
-        hover: travel height in metres.
-        grasp: x and y of the grasp relative to the circle's centre, in metres.
-        place: x and y of the final position relative to the goal, as a fraction (-1..1) of the allowed spread.
-    """
-
-    speed: float
-    behind: float
+    speed: float  # factor of all speeds
+    behind: float  # start of a push in metres, see Manner
     aside: float
-    hover: float
-    grasp: Place
-    place: Place
+    hover: float  # travel height in metres
+    grasp: Place  # x and y of the grasp relative to the circle's centre, in metres
+    place: Place  # x and y of the final position relative to the goal, as a fraction (-1..1) of the allowed spread
 
 
 def style(rng: np.random.Generator) -> Style:
@@ -248,10 +193,9 @@ class _Expert:
 
 
 def moves(env: "TableTopEnvironment", task: str, how: Style, height: float | None = None, feedback: bool = True) -> Moves:
-    """Generate the commands of a task's expert in the current scene; the environment is not stepped.
+    """Generate the commands of a task's expert in the current scene; the environment, after reset, is not stepped.
 
     Args:
-        env, task, how: environment after reset, known task, and style of the demonstration.
         height: push height in metres above the table; by default above the surface under the circle.
         feedback: whether pushes observe the circle; otherwise they go straight to the triangle's initial position.
     """
@@ -323,18 +267,15 @@ def _straight(expert: _Expert, height: float) -> Moves:
 def led_astray(env: "TableTopEnvironment", task: str, rng: np.random.Generator) -> dict[str, NDArray[Any]]:
     """Start a recovery from a failure: the hand on any side of the circle, low or above it, open or closed and empty in picks.
 
-    With probability :data:`MISLAID` the circle lies elsewhere, also outside its initial range. Open hands are above it. The
-    environment was reset to a scene of the task, which is changed.
+    With probability :data:`MISLAID` the circle lies elsewhere, also outside its initial range. Open hands are above it.
     """
     circle, others = env.places()[CIRCLE], {name: env.outline(name) for name in env.bodies.objects if name != CIRCLE}
     below, picks = support(env.scene, CIRCLE), task not in PUSHES
-    highest = HIGHEST if picks else CLEAR
-    on_book = below > 0
-    surface = others.pop(BOOK) if on_book else None
+    surface, highest = others.pop(BOOK) if below > 0 else None, HIGHEST if picks else CLEAR
     while True:
         place = circle[:2]
         if rng.random() < MISLAID:
-            place = place + rng.uniform(-0.03, 0.03, 2) if on_book else np.array([rng.uniform(*limits) for limits in ASTRAY])
+            place = place + rng.uniform(-0.03, 0.03, 2) if below > 0 else np.array([rng.uniform(*limits) for limits in ASTRAY])
         shape = outline(CIRCLE, float(place[0]), float(place[1]), 0.0)
         if surface is not None and not within(shape, surface):
             continue

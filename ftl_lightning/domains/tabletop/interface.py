@@ -1,7 +1,4 @@
-"""Table-top without the simulator: cameras, observations, actions, tasks, and views for models.
-
-Views transform scenes at random in training.
-"""
+"""Table-top without the simulator: cameras, observations, actions, tasks, and views, which augment scenes in training."""
 
 import math
 from dataclasses import dataclass, replace
@@ -23,19 +20,13 @@ from ftl_lightning.services.shipped import check_extra
 
 @dataclass(frozen=True)
 class Camera:
-    """Fixed camera.
+    """Fixed camera."""
 
-    Attributes:
-        eye, target, up: metres.
-        angle: vertical field of view in degrees.
-        size: height and width of images.
-    """
-
-    eye: tuple[float, float, float]
+    eye: tuple[float, float, float]  # metres
     target: tuple[float, float, float]
     up: tuple[float, float, float]
-    angle: float
-    size: tuple[int, int]
+    angle: float  # vertical field of view in degrees
+    size: tuple[int, int]  # height and width of images
 
     def _matrices(self) -> tuple[list[float], list[float]]:
         view = pybullet().computeViewMatrix(self.eye, self.target, self.up)
@@ -44,10 +35,8 @@ class Camera:
     def picture(self, client: Simulator, shadow: bool = False) -> NDArray[np.uint8]:
         """Image ``(height, width, 3)`` of pybullet's software renderer."""
         height, width = self.size
-        view, lens = self._matrices()
-        seen = client.getCameraImage(
-            width, height, view, lens, lightDirection=[0.3, -0.6, 1.5], shadow=int(shadow), renderer=pybullet().ER_TINY_RENDERER
-        )
+        options = {"lightDirection": [0.3, -0.6, 1.5], "shadow": int(shadow), "renderer": pybullet().ER_TINY_RENDERER}
+        seen = client.getCameraImage(width, height, *self._matrices(), **options)
         rgba: NDArray[np.uint8] = np.asarray(seen[2], dtype=np.uint8).reshape(height, width, 4)
         return np.ascontiguousarray(rgba[..., :3])
 
@@ -59,10 +48,8 @@ class Camera:
         return (np.array([1, 1]) + seen * (1, -1)) / 2 * (self.size[1], self.size[0])
 
 
-OVERHEAD = Camera((0.5, 0.0, 0.85), (0.5, 0.0, 0.0), (1.0, 0.0, 0.0), 45.0, (64, 64))
-"""Camera of the model."""
-FRONT = Camera((1.15, 0.0, 0.65), (0.53, 0.0, 0.05), (-1.0, 0.0, 1.0), 36.0, (240, 320))
-"""Camera of films."""
+OVERHEAD = Camera((0.5, 0.0, 0.85), (0.5, 0.0, 0.0), (1.0, 0.0, 0.0), 45.0, (64, 64))  # Camera of the model
+FRONT = Camera((1.15, 0.0, 0.65), (0.53, 0.0, 0.05), (-1.0, 0.0, 1.0), 36.0, (240, 320))  # Camera of films
 
 
 NAME, WIDE_NAME = "tabletop", "tabletop_wide"
@@ -70,18 +57,12 @@ STATE_NAMES = ("hand.x", "hand.y", "hand.z", "gripper.opening")
 STATE_UNITS = ("m",) * 4
 IMAGE, POSE, PLACES = "image", "pose", "places"
 FEATURES = {IMAGE: Feature((3, *OVERHEAD.size), "image"), POSE: Feature((8,), state=(0, 1, 2, 7))}
-"""Image of the overhead camera, without the arm; measured position (m), quaternion (real part last) and opening (m) of the hand.
-
-Position and opening are the initial state of a plan, up to the arm's lag of millimetres behind the command.
-"""
-SEEN = Feature((5, 4))
-"""Privileged feature: visibility and centre (m) of each object, only for images of a training set."""
-ACTION = 4
-"""Size of an action: position of the hand (m) and opening of the gripper (m)."""
-HERTZ = 10
-"""Actions per second."""
-MAX_STEPS = 160
-"""Maximum steps per episode, as in the paper: 16 seconds."""
+"""Image of the overhead camera, without the arm; measured position (m), quaternion (real part last) and opening (m) of the hand,
+which are the initial state of a plan, up to the arm's lag of millimetres behind the command."""
+SEEN = Feature((5, 4))  # Privileged feature: visibility and centre (m) of each object, only for images of a training set
+ACTION = 4  # Size of an action: position of the hand (m) and opening of the gripper (m)
+HERTZ = 10  # Actions per second
+MAX_STEPS = 160  # Maximum steps per episode, as in the paper: 16 seconds
 OPEN, THRESHOLD = 0.08, 0.06
 """Opening of an open gripper in metres, and threshold above which an action opens the gripper instead of closing it."""
 
@@ -102,14 +83,12 @@ PUSH_TO_WHITE = "push green circle to elevated white surface"
 PUSH_TO_BOOK = "push green circle to book"
 BESIDE_TRIANGLE = "pick green circle to beside orange triangle"
 
-TRAINING_CONCEPTS = (TO_BOOK, TO_WHITE, PUSH, AROUND_BOWL)
-"""Training concepts of the paper."""
+TRAINING_CONCEPTS = (TO_BOOK, TO_WHITE, PUSH, AROUND_BOWL)  # Training concepts of the paper
 WIDE_CONCEPTS = (*TRAINING_CONCEPTS, PUSH_TO_BOWL, PUSH_TO_WHITE, BESIDE_TRIANGLE)
 """Training concepts of the wide model: more pushes and picks, none of which is an evaluation task."""
 TASKS = (*TRAINING_CONCEPTS, PUSH_ON_BOOK, BESIDE_BOWL, PUSH_TO_BOWL, PUSH_TO_WHITE, PUSH_TO_BOOK, BESIDE_TRIANGLE)
 PUSHES = tuple(task for task in TASKS if task.startswith("push"))
-BESIDE = (BESIDE_BOWL, BESIDE_TRIANGLE)
-"""Picks that end on the table."""
+BESIDE = (BESIDE_BOWL, BESIDE_TRIANGLE)  # Picks that end on the table
 
 SUITES = {
     "training": training_suite(TRAINING_CONCEPTS),
@@ -117,10 +96,8 @@ SUITES = {
     "representation": Suite((EvaluationTask("training representation", PUSH_ON_BOOK, texts=(PUSH,)),)),
     "validation": Suite((EvaluationTask("new concept", BESIDE_BOWL, (BESIDE_BOWL,)),)),
 }
-"""The validation task is of another kind, so that nothing is tuned on the evaluation task.
-
-``representation`` is the paper's baseline: scenes of the new task with the text of the push on the table.
-"""
+"""The validation task is of another kind, so that nothing is tuned on the evaluation task. ``representation`` is the paper's
+baseline: scenes of the new task with the text of the push on the table."""
 WIDE_SUITES = {
     "training": training_suite(WIDE_CONCEPTS),
     "paper": SUITES["paper"],
@@ -140,34 +117,24 @@ HAND, POINTS, MOVED = "hand", "points", "moved"
 ORIGIN = "origin"
 """Feature of the hand position in the image: column and row, -1..1, with the view ``hand``; x and y from the centre, in half
 images, with ``points``."""
-SHIFT = 0.07
-"""Maximum shift of a scene in metres, in x and in y."""
-RAISED = 0.05
-"""Maximum elevation in metres of half of the scenes without image, so that pushes and picks generalise to any surface."""
-TURN = 0.5
-"""Maximum rotation in radians of half of the scenes; others are rotated by any angle."""
-BLUR = (0.004, 0.004, 0.002)
-"""Standard deviation of the errors of an image encoder on new scenes, in metres, in x, y and height."""
-SURE = 6.0
-"""Visibility logit of a confident encoder."""
-HALF = OVERHEAD.eye[2] * math.tan(math.radians(OVERHEAD.angle) / 2)
-"""Metres of the table from the centre of an image to its edge."""
-MIDDLE = OVERHEAD.target[:2]
-"""x and y of the centre of an image."""
+SHIFT = 0.07  # Maximum shift of a scene in metres, in x and in y
+RAISED = 0.05  # Maximum elevation in metres of half of the scenes without image, so that pushes and picks generalise to any surface
+TURN = 0.5  # Maximum rotation in radians of half of the scenes; others are rotated by any angle
+BLUR = (0.004, 0.004, 0.002)  # Standard deviation of the errors of an image encoder on new scenes, in metres, in x, y and height
+SURE = 6.0  # Visibility logit of a confident encoder
+HALF = OVERHEAD.eye[2] * math.tan(math.radians(OVERHEAD.angle) / 2)  # Metres of the table from the centre of an image to its edge
+MIDDLE = OVERHEAD.target[:2]  # x and y of the centre of an image
 
 
 def moved(states: Tensor, observed: Observed, mirrored: Tensor, angles: Tensor, shifts: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-    """Mirror a scene, rotate it about the image centre and shift it: states and observations.
+    """Mirror a scene, rotate it about the image centre and shift it: states ``(sample, horizon, 4)`` and observations.
 
-    The camera looks straight down, so that the image moves with the table, except for a few per cent of perspective of high
-    objects. The yaw of the hand, which plans do not command, is constant.
+    The camera looks straight down: the image moves with the table, up to a few per cent of perspective of high objects. The yaw of
+    the hand, which plans do not command, is constant.
 
     Args:
-        states: ``(sample, horizon, 4)``.
         observed: ``pose``, optionally ``image`` and the privileged ``places``.
-        mirrored: ``(sample,)`` of bool, left and right exchanged.
-        angles: ``(sample,)`` in radians.
-        shifts: ``(sample, 2)`` in metres, x and y.
+        mirrored, angles, shifts: ``(sample,)`` of bool, left and right exchanged; ``(sample,)`` in radians; ``(sample, 2)`` in m.
     """
     cos, sin = angles.cos(), angles.sin()
     side = torch.where(mirrored, -1.0, 1.0)
@@ -186,10 +153,9 @@ def moved(states: Tensor, observed: Observed, mirrored: Tensor, angles: Tensor, 
     theta = torch.cat((back.flip(1, 2), offset.flip(1)[..., None]), dim=-1)
     result = {**observed, POSE: places(observed[POSE])}
     if IMAGE in observed:
-        images = observed[IMAGE]
-        grid = functional.affine_grid(theta, list(images.shape), align_corners=False)
-        drawn = functional.grid_sample(images.float(), grid, padding_mode="border", align_corners=False)
-        result[IMAGE] = drawn.round().to(torch.uint8)
+        grid = functional.affine_grid(theta, list(observed[IMAGE].shape), align_corners=False)
+        image = functional.grid_sample(observed[IMAGE].float(), grid, padding_mode="border", align_corners=False)
+        result[IMAGE] = image.round().to(torch.uint8)
     if PLACES in observed:
         seen, centres = observed[PLACES].split((1, 3), dim=-1)
         centres = places(centres)
@@ -213,9 +179,8 @@ def misplaced(read: Tensor, places: Tensor) -> Tensor:
     Absolute errors of the centres of visible objects, in half images, plus .01 times the cross-entropy of visibility.
 
     Args:
-        read: x, y, height and visibility logit of each object, all x first ``(sample, 20)``; see
-            :class:`ftl_lightning.networks.image_encoder.ImageEncoder`.
-        places: :data:`~ftl_lightning.domains.tabletop.interface.SEEN` ``(sample, 5, 4)``.
+        read: x, y, height and visibility logit of each object, all x first ``(sample, 20)``; see :class:`.ImageEncoder`.
+        places: :data:`SEEN` ``(sample, 5, 4)``.
     """
     read, seen = read.unflatten(1, (4, -1)).transpose(1, 2), places[..., 0]
     off = read[..., :3] - (places[..., 1:] - places.new_tensor((*MIDDLE, 0.0))) / HALF
@@ -224,15 +189,7 @@ def misplaced(read: Tensor, places: Tensor) -> Tensor:
 
 
 def told(places: Tensor, draw: torch.Generator) -> Tensor:
-    """Simulate the keypoints of an image encoder: centres of visible objects with errors of :data:`BLUR`.
-
-    Args:
-        places: :data:`~ftl_lightning.domains.tabletop.interface.SEEN` ``(sample, 5, 4)``.
-        draw: generator of the errors.
-
-    Returns:
-        keypoints in the form of :func:`misplaced`.
-    """
+    """Simulate the keypoints of an image encoder, in the form of :func:`misplaced`: visible centres with errors of :data:`BLUR`."""
     seen, centres = places[..., :1], places[..., 1:] - places.new_tensor((*MIDDLE, 0.0))
     wrong = drawn(len(centres), lambda n: torch.randn((n, *centres.shape[1:]), generator=draw, device=centres.device))
     wrong = wrong * centres.new_tensor(BLUR)
@@ -284,8 +241,5 @@ VIEWS = {
         same_columns=True,
     ),
 }
-"""``model.perturb`` mirrors, rotates and shifts scenes at random, together with their states.
-
-``hand`` has states relative to the hand; keypoints of images can be relative too, see :data:`ORIGIN`. ``points`` is the same for
-encoders of x and y of objects. ``moved`` has absolute states.
-"""
+"""``hand`` has states relative to the hand; keypoints of images can be relative too, see :data:`ORIGIN`. ``points`` is the same for
+encoders of x and y of objects. ``moved`` has absolute states."""

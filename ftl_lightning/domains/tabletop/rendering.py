@@ -18,17 +18,12 @@ from ftl_lightning.domains.tabletop.world import ARM, COLOUR, FINGERS, TABLE_COL
 from ftl_lightning.services.text import figure_text
 
 MAX_COLUMNS = 4
-FRAMES = 60
-"""Maximum number of frames of an episode."""
-_OPEN, _CLOSED = (0, 150, 255), (255, 0, 90)
-"""Colours of a plan's states in a film, by gripper command."""
+FRAMES = 60  # Maximum number of frames of an episode
+_OPEN, _CLOSED = (0, 150, 255), (255, 0, 90)  # Colours of a plan's states in a film, by gripper command
 
 
 def render(states: Tensor, right: Sequence[bool] | None, title: str, starts: InitialStates | None) -> Figure:
-    """Grid of tables from above with the hand's paths of plans ``(sample, horizon, 4)``; without scenes, paths only.
-
-    Frames are green for right plans, red for wrong plans, and grey for ``None``.
-    """
+    """Tables from above with the hand's paths of plans ``(sample, horizon, 4)``; frames are green, red, or grey for ``None``."""
     columns = min(len(states), MAX_COLUMNS)
     rows = -(-len(states) // columns)
     figure = Figure(figsize=(2.2 * columns, 1.8 * rows + 0.4), layout="constrained")
@@ -61,10 +56,9 @@ def film(rollout: Rollout, plans: Tensor) -> list[NDArray[np.uint8]]:
     check_simulator()
     from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
 
-    trace = rollout.infos[0].get("trace", [])
+    trace, pictures = rollout.infos[0].get("trace", []), []
     times = np.unique(np.linspace(0, max(len(trace) - 1, 0), FRAMES).round().astype(int))
     env = TableTopEnvironment(arm_drawn=True)
-    pictures = []
     try:
         env.reset(options={"scene": rollout.starts.require_scenes()[0].numpy()})
         for time in times:
@@ -87,12 +81,9 @@ def _with_plan(picture: NDArray[np.uint8], plan: NDArray[np.float32]) -> NDArray
     return drawn
 
 
-DEPTH = 0.45
-"""Vertical shift per depth in vector films."""
-LAYERS = 4
-"""Stacked outlines per object."""
-SHAPE_FRAMES, SPEED = 50, 2.0
-"""Maximum number of frames and speed factor of vector films."""
+DEPTH = 0.45  # Vertical shift per depth in vector films
+LAYERS = 4  # Stacked outlines per object
+SHAPE_FRAMES, SPEED = 50, 2.0  # Maximum number of frames and speed factor of vector films
 HAND, WAY = "#5a5f66", "#d0006f"
 
 
@@ -150,8 +141,7 @@ def _hand(places: NDArray[np.floating], opening: NDArray[np.floating]) -> Iterat
         yield Shape("line", finger.astype(np.float32), HAND, 0.01)
 
 
-FAR = 0.78
-"""x that is drawn at height 0."""
+FAR = 0.78  # x that is drawn at height 0
 
 
 def _front(points: NDArray[np.floating]) -> NDArray[np.float64]:

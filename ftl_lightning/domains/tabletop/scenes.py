@@ -1,12 +1,12 @@
-"""Scenes: 24 numbers, the poses of the objects on the table and the initial pose of the hand, in metres and radians.
+"""Scenes: 24 numbers, of each object (present, x, y, yaw) and of the initial hand (x, y, z, yaw), in metres and radians.
 
-The robot's base is the origin, the table's top is z = 0. An object has four numbers (present, x, y, yaw), the hand four
-(x, y, z, yaw).
+The robot's base is the origin, the table's top is z = 0.
 """
 
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 import torch
@@ -34,8 +34,7 @@ from ftl_lightning.services.randomness import task_key
 CIRCLE, TRIANGLE, BOOK, WHITE, BOWL = OBJECTS = ("green circle", "orange triangle", "book", "white surface", "purple bowl")
 COLUMNS = {name: slice(4 * number, 4 * number + 4) for number, name in enumerate(OBJECTS)}
 """Columns (present, x, y, yaw) of each object."""
-HAND = slice(4 * len(OBJECTS), 4 * len(OBJECTS) + 4)
-"""Columns (x, y, z, yaw) of the hand."""
+HAND = slice(4 * len(OBJECTS), 4 * len(OBJECTS) + 4)  # Columns (x, y, z, yaw) of the hand
 SCENE = HAND.stop
 
 TARGET = {
@@ -56,21 +55,15 @@ RADIUS = {CIRCLE: 0.025, BOWL: 0.05, TRIANGLE: 0.07 / math.sqrt(3)}
 """Radii of circle and bowl, and circumradius of the triangle with sides of 7 cm."""
 SIZE = {BOOK: (0.22, 0.16), WHITE: (0.13, 0.13)}
 HEIGHT = {CIRCLE: 0.03, TRIANGLE: 0.03, BOOK: 0.03, WHITE: 0.06, BOWL: 0.045}
-WORKSPACE = ((0.36, 0.66), (-0.24, 0.24))
-"""x and y ranges of the centres of circle and triangle."""
-SIGHT = ((0.22, 0.78), (-0.34, 0.34))
-"""x and y ranges that contain every object: seen by the camera, not touched by the arm."""
-START = ((0.39, 0.45), (-0.03, 0.03), (0.17, 0.23), (-0.1, 0.1))
-"""Ranges of the hand's initial pose."""
-RING = RADIUS[BOWL] + RADIUS[CIRCLE] + 0.028
-"""Radius in metres of the circle's path around the bowl."""
+WORKSPACE = ((0.36, 0.66), (-0.24, 0.24))  # x and y ranges of the centres of circle and triangle
+SIGHT = ((0.22, 0.78), (-0.34, 0.34))  # x and y ranges that contain every object: seen by the camera, not touched by the arm
+START = ((0.39, 0.45), (-0.03, 0.03), (0.17, 0.23), (-0.1, 0.1))  # Ranges of the hand's initial pose
+RING = RADIUS[BOWL] + RADIUS[CIRCLE] + 0.028  # Radius in metres of the circle's path around the bowl
 BOWL_BESIDE = (0.008, 0.03)
 """Range in metres of the bowl's offset from the line from circle to triangle; its side decides which path is shorter."""
-APART = 0.002
-"""Minimum gap in metres between objects."""
+APART = 0.002  # Minimum gap in metres between objects
 
-Points = NDArray[np.float64]
-"""Corners ``(n, 2)`` of a convex outline, counter-clockwise."""
+Points = NDArray[np.float64]  # Corners (n, 2) of a convex outline, counter-clockwise
 
 
 def outline(name: str, x: float, y: float, yaw: float) -> Points:
@@ -92,11 +85,8 @@ def _normals(points: Points) -> Points:
 
 def gap(one: Points, other: Points) -> float:
     """Gap between two outlines in metres; a lower bound between corners, negative for overlap."""
-    sides = []
-    for a, b in ((one, other), (other, one)):
-        normals = _normals(a)
-        sides.append(((b @ normals.T).min(axis=0) - (a @ normals.T).max(axis=0)).max())
-    return float(max(sides))
+    pairs = ((one, other, _normals(one)), (other, one, _normals(other)))
+    return float(max(((b @ normals.T).min(axis=0) - (a @ normals.T).max(axis=0)).max() for a, b, normals in pairs))
 
 
 def within(one: Points, other: Points) -> bool:
@@ -120,9 +110,8 @@ def support(scene: NDArray[np.float32], name: str) -> float:
 def check(scene: Sequence[float] | NDArray[np.float32]) -> NDArray[np.float32]:
     """Validate a scene and return it as an array.
 
-    Raises:
-        UserError: for a wrong size, numbers that are not finite, no circle, objects that overlap (circle and triangle may lie on
-            the book, as a whole) or leave the workspace, or a hand outside its initial range.
+    A ``UserError`` for a wrong size, numbers that are not finite, no circle, objects that overlap (circle and triangle may lie on
+    the book, as a whole) or leave the workspace, or a hand outside its initial range.
     """
     array = np.asarray(scene, dtype=np.float32)
     require(array.shape == (SCENE,), "table-top scene", f"{SCENE} numbers", f"shape {array.shape}")
@@ -149,14 +138,10 @@ def check(scene: Sequence[float] | NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 Rng = np.random.Generator
-Pose = tuple[float, float, float]
-"""x, y and yaw."""
-_Placed = dict[str, Pose]
-"""Poses by object name."""
-PRESENT = 0.7
-"""Probability of a distractor, if it fits; without distractors the image reveals the task."""
-TRIES = 30
-"""Maximum number of positions tried per object."""
+Pose = tuple[float, float, float]  # x, y and yaw
+_Placed = dict[str, Pose]  # Poses by object name
+PRESENT = 0.7  # Probability of a distractor, if it fits; without distractors the image reveals the task
+TRIES = 30  # Maximum number of positions tried per object
 
 
 def anywhere(rng: Rng) -> tuple[float, float]:
@@ -169,11 +154,8 @@ def random_yaw(rng: Rng, name: str) -> float:
     return float(rng.uniform(-0.4, 0.4)) if name in SIZE else float(rng.uniform(-math.pi, math.pi))
 
 
-def _pick(target: str) -> Callable[[Rng], _Placed]:
-    def draw(rng: Rng) -> _Placed:
-        return {name: (*anywhere(rng), random_yaw(rng, name)) for name in (CIRCLE, target)}
-
-    return draw
+def _pick(rng: Rng, target: str) -> _Placed:
+    return {name: (*anywhere(rng), random_yaw(rng, name)) for name in (CIRCLE, target)}
 
 
 def _pair(rng: Rng, near: float, far: float) -> _Placed:
@@ -184,15 +166,11 @@ def _pair(rng: Rng, near: float, far: float) -> _Placed:
     return {CIRCLE: (x, y, 0.0), TRIANGLE: (float(end[0]), float(end[1]), random_yaw(rng, TRIANGLE))}
 
 
-def _push_to(target: str, near: float, far: float) -> Callable[[Rng], _Placed]:
+def _push_to(rng: Rng, target: str, near: float, far: float) -> _Placed:
     """Draw circle and target at a centre distance."""
-
-    def draw(rng: Rng) -> _Placed:
-        placed = _pair(rng, near, far)
-        x, y, _ = placed.pop(TRIANGLE)
-        return {**placed, target: (x, y, random_yaw(rng, target))}
-
-    return draw
+    placed = _pair(rng, near, far)
+    x, y, _ = placed.pop(TRIANGLE)
+    return {**placed, target: (x, y, random_yaw(rng, target))}
 
 
 def _around(rng: Rng) -> _Placed:
@@ -216,14 +194,14 @@ def _on_book(rng: Rng) -> _Placed:
 
 
 NEEDED: Mapping[str, Callable[[Rng], _Placed]] = {
-    TO_BOOK: _pick(BOOK),
-    TO_WHITE: _pick(WHITE),
-    BESIDE_BOWL: _pick(BOWL),
-    BESIDE_TRIANGLE: _pick(TRIANGLE),
-    PUSH: lambda rng: _pair(rng, 0.12, 0.24),
-    PUSH_TO_BOWL: _push_to(BOWL, 0.14, 0.26),
-    PUSH_TO_WHITE: _push_to(WHITE, 0.17, 0.28),
-    PUSH_TO_BOOK: _push_to(BOOK, 0.19, 0.30),
+    TO_BOOK: partial(_pick, target=BOOK),
+    TO_WHITE: partial(_pick, target=WHITE),
+    BESIDE_BOWL: partial(_pick, target=BOWL),
+    BESIDE_TRIANGLE: partial(_pick, target=TRIANGLE),
+    PUSH: partial(_pair, near=0.12, far=0.24),
+    PUSH_TO_BOWL: partial(_push_to, target=BOWL, near=0.14, far=0.26),
+    PUSH_TO_WHITE: partial(_push_to, target=WHITE, near=0.17, far=0.28),
+    PUSH_TO_BOOK: partial(_push_to, target=BOOK, near=0.19, far=0.30),
     AROUND_BOWL: _around,
     PUSH_ON_BOOK: _on_book,
 }
@@ -309,13 +287,10 @@ def scenes(task: str, count: int, seed: int) -> Tensor:
     return torch.from_numpy(np.stack(drawn))
 
 
-SURFACES = (BOOK, WHITE)
-"""Objects that can carry the triangle."""
-RAISED = 0.5
-"""Probability of a triangle on a surface, if one is visible."""
+SURFACES = (BOOK, WHITE)  # Objects that can carry the triangle
+RAISED = 0.5  # Probability of a triangle on a surface, if one is visible
 
-HIDDEN: Pose = (-5.0, 0.0, 0.0)
-"""Position of objects that an image does not show."""
+HIDDEN: Pose = (-5.0, 0.0, 0.0)  # Position of objects that an image does not show
 
 
 def free_pose(rng: np.random.Generator, name: str, taken: Mapping[str, Points]) -> tuple[float, Pose]:

@@ -15,25 +15,11 @@ from ftl_lightning.data.demonstrations import Demonstrations, concatenate, padde
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.data.formats.files import cached
 from ftl_lightning.domains.domain import Split
-from ftl_lightning.domains.tabletop import environment, experts, world
+from ftl_lightning.domains.tabletop import environment, experts, interface, world
 from ftl_lightning.domains.tabletop import scenes as layouts
 from ftl_lightning.domains.tabletop.environment import TableTopEnvironment, judged
 from ftl_lightning.domains.tabletop.experts import PAST, SLIP, SLIPS, STAY, TREMBLE, led_astray, moves, style
-from ftl_lightning.domains.tabletop.interface import (
-    FEATURES,
-    IMAGE,
-    NAME,
-    OVERHEAD,
-    PLACES,
-    POSE,
-    PUSH,
-    PUSHES,
-    STATE_NAMES,
-    STATE_UNITS,
-    TRAINING_CONCEPTS,
-    Camera,
-    check_task,
-)
+from ftl_lightning.domains.tabletop.interface import FEATURES, IMAGE, NAME, OVERHEAD, PLACES, POSE, PUSH, PUSHES, Camera
 from ftl_lightning.domains.tabletop.scenes import HEIGHT, HIDDEN, NEEDED, PRESENT, SURFACES, draw_scene, free_pose, outline, scenes
 from ftl_lightning.domains.tabletop.world import turned
 from ftl_lightning.services.errors import require
@@ -41,16 +27,11 @@ from ftl_lightning.services.randomness import VALIDATION_SEED, task_key
 
 _LOG = logging.getLogger(__name__)
 
-MOST = 4
-"""Maximum attempts per demonstration."""
-VERSION = 5
-"""Version of the experts; part of the cache key."""
-TIMES = {PUSH: 4}
-"""Factors of the demonstrations per training concept: the paper has 124 of the push, 29 to 31 of others."""
-RECOVERY_SEED = 2_000_000
-"""Seed offset of recovery demonstrations."""
-_NO_SETTINGS = ("ROUND", "FEATURES", "NEEDED", "TYPE_CHECKING")
-"""Constants without influence on a demonstration."""
+MOST = 4  # Maximum attempts per demonstration
+VERSION = 5  # Version of the experts; part of the cache key
+TIMES = {PUSH: 4}  # Factors of the demonstrations per training concept: the paper has 124 of the push, 29 to 31 of others
+RECOVERY_SEED = 2_000_000  # Seed offset of recovery demonstrations
+_NO_SETTINGS = ("ROUND", "FEATURES", "NEEDED", "TYPE_CHECKING")  # Constants without influence on a demonstration
 _SETTINGS = {
     f"{module.__name__.rpartition('.')[2]}.{name}": value
     for module in (environment, experts, layouts, world)
@@ -62,23 +43,14 @@ _SETTINGS = {
 
 @dataclass(frozen=True)
 class Episode:
-    """Episode of an expert.
+    """Episode of an expert."""
 
-    Attributes:
-        commands: ``(time, 4)``, executed commands; the first is the initial state.
-        actions: ``(steps, 4)``, actions passed to the environment, which shortens moves that are too far.
-        images: ``(time, 3, 64, 64)`` uint8.
-        poses: ``(time, 8)``, measured.
-        success: whether the task is done.
-        places: ``(time, 5, 4)``, object positions in the images; only with scattered distractors.
-    """
-
-    commands: NDArray[np.float32]
-    actions: NDArray[np.float32]
-    images: NDArray[np.uint8]
-    poses: NDArray[np.float32]
-    success: bool
-    places: NDArray[np.float32] | None = None
+    commands: NDArray[np.float32]  # (time, 4), executed; the first is the initial state
+    actions: NDArray[np.float32]  # (steps, 4), passed to the environment, which shortens moves that are too far
+    images: NDArray[np.uint8]  # (time, 3, 64, 64)
+    poses: NDArray[np.float32]  # (time, 8), measured
+    success: bool  # whether the task is done
+    places: NDArray[np.float32] | None = None  # (time, 5, 4), object positions in the images; only with scattered distractors
 
 
 Begin = Callable[[TableTopEnvironment, str, np.random.Generator], dict[str, NDArray[Any]]]
@@ -88,19 +60,11 @@ Begin = Callable[[TableTopEnvironment, str, np.random.Generator], dict[str, NDAr
 def scattered(
     env: TableTopEnvironment, task: str, trace: Sequence[NDArray[np.float64]], rng: np.random.Generator
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """Images ``(time, 3, 64, 64)`` of the overhead camera of a finished episode, and object positions.
+    """Images ``(time, 3, 64, 64)`` of a finished episode, and positions ``(time, 5, 4)``, see :meth:`.TableTopEnvironment.seen`.
 
-    Few demonstrations have few layouts, and a network memorises demonstrations by their distractors. Random distractors carry no
-    information (domain randomisation, Tobin et al., 2017). The triangle also lies on book and block, where it looks larger.
-
-    Args:
-        env: environment of the episode; its objects are moved.
-        task: known task.
-        trace: ``trace`` of the episode's last info.
-        rng: random generator of positions and visibility.
-
-    Returns:
-        Images, and positions ``(time, 5, 4)``, see :meth:`.TableTopEnvironment.seen`.
+    Networks memorise few demonstrations by their distractors. Random distractors carry no information (domain randomisation, Tobin
+    et al., 2017). The triangle also lies on book and block, where it looks larger. ``trace`` is that of the episode's last info;
+    the objects of ``env`` are moved.
     """
     needed = NEEDED[task](np.random.default_rng(0))
     objects = env.bodies.objects
@@ -131,19 +95,13 @@ def perform(
     scatter: bool = False,
     begin: Begin | None = None,
 ) -> Episode:
-    """Run an episode of a task's expert.
+    """Run an episode of a task's expert from a scene; a ``UserError`` for an invalid scene.
 
     Args:
-        env: environment, which is reset.
-        task: known task.
-        scene: scene of the task.
-        rng: random generator of style and noise.
+        rng: generator of style and noise.
         height, feedback: see :func:`moves`.
-        scatter: whether to move distractors in each image, see :mod:`ftl_lightning.domains.tabletop.source`.
+        scatter: whether to move distractors in each image, see :func:`scattered`.
         begin: change of the scene before the demonstration, such as :func:`led_astray`; ``None`` for no change.
-
-    Raises:
-        UserError: for an invalid scene.
     """
     seen, info = env.reset(options={"scene": scene})
     if begin is not None:
@@ -181,8 +139,7 @@ def _stayed(values: list[Any]) -> NDArray[Any]:
 
 Job = tuple[str, int, int, bool, bool]
 """Task, seed, episode number, whether distractors are scattered in each image, and whether the episode is a recovery."""
-_ENVIRONMENT: list[TableTopEnvironment] = []
-"""Environment of this process."""
+_ENVIRONMENT: list[TableTopEnvironment] = []  # Environment of this process
 
 
 def _scene(job: Job) -> np.ndarray:
@@ -215,25 +172,14 @@ def _episodes(jobs: list[Job], workers: int) -> Iterator[Episode | None]:
 
 
 def demonstrations(
-    task: str,
-    count: int,
-    seed: int,
-    workers: int,
-    progress: Callable[[], None],
-    scatter: bool = False,
-    elsewhere: bool = False,
+    task: str, count: int, seed: int, workers: int, progress: Callable[[], None], scatter: bool = False, elsewhere: bool = False
 ) -> Demonstrations:
-    """The first ``count`` successful episodes of a task by number, independent of the number of workers.
+    """The first ``count`` successful episodes of a task by number, independent of ``workers``; a ``UserError`` if there are fewer.
 
     Args:
-        task: known task.
-        count, seed, workers: numbers of demonstrations and processes, and seed of scenes, styles and noise.
         progress: called after each successful episode.
         scatter: whether to scatter distractors in each image, with object positions as a privileged feature.
         elsewhere: whether episodes are recoveries, with the hand anywhere around the circle.
-
-    Raises:
-        UserError: if too few episodes succeed.
     """
     kept: list[tuple[Job, Episode]] = []
     jobs = [(task, seed, number, scatter, elsewhere) for number in range(MOST * count)]
@@ -267,8 +213,8 @@ def joined_episodes(
         states=states,
         lengths=lengths,
         domain=NAME,
-        state_names=STATE_NAMES,
-        state_units=STATE_UNITS,
+        state_names=interface.STATE_NAMES,
+        state_units=interface.STATE_UNITS,
         concepts=(task,) * len(episodes),
         observed=observed,
         per_step=tuple(observed),
@@ -278,16 +224,10 @@ def joined_episodes(
 
 
 class Expert:
-    """Successful episodes of the scripted experts, cached.
-
-    Args:
-        concepts: training concepts.
-        domain: name of the domain.
-        begun_anew: tasks that also have recoveries; ``None`` for pushes only.
-    """
+    """Successful episodes of the scripted experts, cached; tasks ``begun_anew``, by default pushes, also have recoveries."""
 
     def __init__(
-        self, concepts: Sequence[str] = TRAINING_CONCEPTS, domain: str = NAME, begun_anew: Sequence[str] | None = None
+        self, concepts: Sequence[str] = interface.TRAINING_CONCEPTS, domain: str = NAME, begun_anew: Sequence[str] | None = None
     ) -> None:
         self.concepts, self.domain = tuple(concepts), domain
         self.begun_anew = tuple(task for task in self.concepts if task in (PUSHES if begun_anew is None else begun_anew))
@@ -306,8 +246,8 @@ class Expert:
         self, task: str, count: int, seed: int, workers: int = 1, scatter: bool = False, elsewhere: bool = False
     ) -> Demonstrations:
         """``count`` demonstrations of a task, see :func:`demonstrations`."""
-        settings = {"domain": NAME, "task": check_task(task), "count": count, "seed": seed, "experts": VERSION, **_SETTINGS}
-        settings |= {"scatter": scatter, "elsewhere": elsewhere}
+        settings = {"domain": NAME, "task": interface.check_task(task), "count": count, "seed": seed, "experts": VERSION}
+        settings |= {**_SETTINGS, "scatter": scatter, "elsewhere": elsewhere}
         made = cached(settings, count, lambda progress: demonstrations(task, count, seed, workers, progress, scatter, elsewhere))
         return made if made.domain == self.domain else replace(made, domain=self.domain)
 

@@ -24,12 +24,9 @@ from ftl_lightning.domains.tabletop.scenes import (
     support,
 )
 
-STEP = 1 / 240
-"""Duration of a simulation step in seconds."""
-FASTEST = 0.02
-"""Maximum hand movement in metres per step of an episode; longer moves are shortened."""
-MASS = {CIRCLE: 0.06, TRIANGLE: 0.15, BOOK: 0.35, WHITE: 0.0, BOWL: 0.0}
-"""Masses in kg; objects of zero mass are fixed."""
+STEP = 1 / 240  # Duration of a simulation step in seconds
+FASTEST = 0.02  # Maximum hand movement in metres per step of an episode; longer moves are shortened
+MASS = {CIRCLE: 0.06, TRIANGLE: 0.15, BOOK: 0.35, WHITE: 0.0, BOWL: 0.0}  # Masses in kg; objects of zero mass are fixed
 FRICTION = {CIRCLE: 0.5, TRIANGLE: 0.6, BOOK: 0.5, WHITE: 0.6, BOWL: 0.6}
 TABLE_FRICTION, FINGER_FRICTION = 0.5, 0.9
 COLOUR = {
@@ -40,21 +37,16 @@ COLOUR = {
     BOWL: (0.50, 0.15, 0.60),
 }
 TABLE_COLOUR = (0.62, 0.55, 0.47)
-MARGIN = 0.001
-"""Collision margin in metres around the triangle's hull."""
+MARGIN = 0.001  # Collision margin in metres around the triangle's hull
 MOVING = (CIRCLE, TRIANGLE, BOOK)
-WALLS = 12
-"""Boxes that approximate the bowl's wall for collisions; the visual shape is round."""
+WALLS = 12  # Boxes that approximate the bowl's wall for collisions; the visual shape is round
 
 ARM = tuple(range(7))
 FINGERS = (9, 10)
-TIP = 11
-"""Link between the fingertips, 7 mm above their ends."""
-REST = (0.0, 0.1, 0.0, -2.4, 0.0, 2.5, 0.785)
-"""Initial joint angles of inverse kinematics."""
+TIP = 11  # Link between the fingertips, 7 mm above their ends
+REST = (0.0, 0.1, 0.0, -2.4, 0.0, 2.5, 0.785)  # Initial joint angles of inverse kinematics
 
-Pose = tuple[tuple[float, float, float], tuple[float, float, float, float]]
-"""Position, and quaternion with its real part last."""
+Pose = tuple[tuple[float, float, float], tuple[float, float, float, float]]  # Position, and quaternion with its real part last
 
 
 @dataclass(frozen=True)
@@ -67,25 +59,22 @@ class Bodies:
 
 def build(client: Simulator, scene: NDArray[np.float32], arm_drawn: bool) -> Bodies:
     """Build a valid scene after a full reset of the simulator; without the arm, images take a twentieth of the time."""
+    import pybullet_data
+
     client.resetSimulation()
     client.setGravity(0, 0, -9.81)
     client.setPhysicsEngineParameter(fixedTimeStep=STEP, deterministicOverlappingPairs=1)
     _box(client, (0.9, 1.0, 0.04), (0.5, 0.0, -0.02), TABLE_COLOUR, 0.0, TABLE_FRICTION)
     # Collision shapes load faster than visual shapes; they are made invisible.
     flags = 0 if arm_drawn else pybullet().URDF_IGNORE_VISUAL_SHAPES
-    robot: int = client.loadURDF(_panda(), [0, 0, 0], useFixedBase=True, flags=flags)
+    panda = Path(pybullet_data.getDataPath()) / "franka_panda" / "panda.urdf"
+    robot: int = client.loadURDF(str(panda), [0, 0, 0], useFixedBase=True, flags=flags)
     for link in () if arm_drawn else range(-1, client.getNumJoints(robot)):
         client.changeVisualShape(robot, link, rgbaColor=[1, 1, 1, 0])
     for finger in FINGERS:
         client.changeDynamics(robot, finger, lateralFriction=FINGER_FRICTION)
     objects = {name: _object(client, scene, name, arm_drawn) for name in OBJECTS if scene[COLUMNS[name]][0] > 0.5}
     return Bodies(robot, objects)
-
-
-def _panda() -> str:
-    import pybullet_data
-
-    return str(Path(pybullet_data.getDataPath()) / "franka_panda" / "panda.urdf")
 
 
 def turned(yaw: float) -> tuple[float, float, float, float]:
@@ -108,13 +97,9 @@ def _box(
     yaw: float = 0.0,
 ) -> int:
     half = [edge / 2 for edge in size]
-    body: int = client.createMultiBody(
-        mass,
-        client.createCollisionShape(pybullet().GEOM_BOX, halfExtents=half),
-        client.createVisualShape(pybullet().GEOM_BOX, halfExtents=half, rgbaColor=[*colour, 1]),
-        place,
-        turned(yaw),
-    )
+    shape = client.createCollisionShape(pybullet().GEOM_BOX, halfExtents=half)
+    seen = client.createVisualShape(pybullet().GEOM_BOX, halfExtents=half, rgbaColor=[*colour, 1])
+    body: int = client.createMultiBody(mass, shape, seen, place, turned(yaw))
     client.changeDynamics(body, -1, lateralFriction=friction)
     return body
 
@@ -150,8 +135,7 @@ def _object(client: Simulator, scene: NDArray[np.float32], name: str, edged: boo
     return body
 
 
-ROUND = 48
-"""Corners of a circle drawn with edges."""
+ROUND = 48  # Corners of a circle drawn with edges
 
 
 def _corners(radius: float, half: float, count: int) -> NDArray[np.float64]:
