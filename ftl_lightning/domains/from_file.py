@@ -80,11 +80,7 @@ class FileSource:
 
 
 def own_domain(
-    examples: Demonstrations,
-    training: Sequence[str],
-    horizon: int,
-    metrics: Mapping[str, float],
-    source: FileSource | None = None,
+    examples: Demonstrations, training: Sequence[str], horizon: int, metrics: Mapping[str, float], source: FileSource | None = None
 ) -> Domain:
     """Domain of user data.
 

@@ -86,11 +86,7 @@ def reached(goal: str, rollout: Rollout) -> dict[str, Tensor]:
     world = rollout.observed[OBSERVED]
     to_target, to_distractor = _to_each(goal, world[..., :3], world[:, 0])
     touched = (to_distractor < REACH).any(dim=1)
-    return {
-        "success": (to_target[:, -1] < REACH) & ~touched,
-        "distractor": touched,
-        "progress": to_target[:, -1] < to_target[:, 0],
-    }
+    return {"success": (to_target[:, -1] < REACH) & ~touched, "distractor": touched, "progress": to_target[:, -1] < to_target[:, 0]}
 
 
 def _encode_steps(states: Tensor, observed: Observed) -> Tensor:
@@ -170,10 +166,7 @@ DOMAIN = Domain(
     name=NAME,
     plans=Plans(HORIZON, STATE_NAMES, STATE_UNITS, start_exponent=3.0, resolution=1e-3),
     concepts=Concepts(
-        training=TRAINING_CONCEPTS,
-        suites=SUITES,
-        reads=reads,
-        table=Path(__file__).parent / "embeddings.safetensors",
+        training=TRAINING_CONCEPTS, suites=SUITES, reads=reads, table=Path(__file__).parent / "embeddings.safetensors"
     ),
     source=lambda root: Expert(),
     observed={OBSERVED: FEATURE},

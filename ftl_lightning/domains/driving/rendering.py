@@ -68,13 +68,7 @@ def _window(around: NDArray[np.float32]) -> Window:
     return low - missing, high + missing
 
 
-def _draw(
-    axes: Axes,
-    name: str,
-    vehicles: NDArray[np.float32],
-    plan: NDArray[np.float32] | None,
-    window: Window,
-) -> None:
+def _draw(axes: Axes, name: str, vehicles: NDArray[np.float32], plan: NDArray[np.float32] | None, window: Window) -> None:
     """Draw lanes and vehicles ``(vehicle, 7)`` to scale, the controlled vehicle first."""
     low, high = window
     for lane in _lanes(name):

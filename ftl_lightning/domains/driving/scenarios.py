@@ -172,11 +172,7 @@ SCENARIOS = {
         cruise=8.0,
     ),
     "roundabout": Scenario(
-        Roundabout,
-        {"duration": 8},
-        _SECOND_EXIT,
-        passed=lambda env: bool(env.vehicle.position[1] < -20),
-        destinations=EXITS,
+        Roundabout, {"duration": 8}, _SECOND_EXIT, passed=lambda env: bool(env.vehicle.position[1] < -20), destinations=EXITS
     ),
     "roundabout third exit": Scenario(ThirdExit, {"duration": 10}, _on(("wx", "wxs"), ("wxs", "wxr")), destinations=EXITS),
     "roundabout of three lanes": _other_roundabout(radius=28, lanes=3, vehicles=7),
