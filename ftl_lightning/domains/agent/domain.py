@@ -8,21 +8,8 @@ from torch import Tensor
 
 from ftl_lightning.data.distances import path_distance
 from ftl_lightning.data.features import InitialStates, Observed, check_starts
+from ftl_lightning.domains.agent import scenes
 from ftl_lightning.domains.agent.expert import NAME, SPEED, STATE_NAMES, STATE_UNITS, Expert, demonstrate, environment
-from ftl_lightning.domains.agent.scenes import (
-    FEATURE,
-    LOOKAHEAD,
-    MAX_STEPS,
-    OBSERVED,
-    PLANE,
-    REACH,
-    STATE,
-    STEP,
-    check_simulator,
-    object_positions,
-    parse,
-    target,
-)
 from ftl_lightning.domains.agent.tasks import PUBLISHED, SUITES, TRAINING_CONCEPTS
 from ftl_lightning.domains.comparison import Comparison, Paper
 from ftl_lightning.domains.domain import ACCURACY, Concepts, Domain, Metric, Plans, Recordings, View, deferred
@@ -38,7 +25,7 @@ RENDERING, STEERING = "ftl_lightning.domains.agent.rendering", "ftl_lightning.do
 def reads(task: str) -> bool:
     """Whether a text is a goal."""
     try:
-        return bool(parse(task))
+        return bool(scenes.parse(task))
     except UserError:
         return False
 
@@ -51,8 +38,8 @@ def _to_each(goal: str, positions: Tensor, world: Tensor) -> tuple[Tensor, Tenso
         positions: agent's positions ``(scene, time, 3)``.
         world: ``(scene, 52)``.
     """
-    both = torch.linalg.vector_norm(positions[:, :, None] - object_positions(world)[:, None], dim=-1)
-    chosen = target(goal, world)[:, None, None].expand(-1, both.shape[1], 1)
+    both = torch.linalg.vector_norm(positions[:, :, None] - scenes.object_positions(world)[:, None], dim=-1)
+    chosen = scenes.target(goal, world)[:, None, None].expand(-1, both.shape[1], 1)
     return both.gather(-1, chosen)[..., 0], both.gather(-1, 1 - chosen)[..., 0]
 
 
@@ -67,7 +54,7 @@ def progressed(goal: str, states: Tensor, starts: InitialStates | None) -> Tenso
     Returns:
         ``(scene,)`` of bool; false where a plan is not finite.
     """
-    world = check_starts(starts).observed[OBSERVED]
+    world = check_starts(starts).observed[scenes.OBSERVED]
     to_target, _ = _to_each(goal, torch.cat((world[:, None, :3], states[:, -1:, :3]), dim=1), world)
     return to_target[:, -1] < to_target[:, 0]
 
@@ -83,21 +70,22 @@ def reached(goal: str, rollout: Rollout) -> dict[str, Tensor]:
         ``(episode,)`` of bool each: ``success``, the agent ends within :data:`REACH` of the target and never was within
         :data:`REACH` of the distractor; ``distractor``, it was; ``progress``, it ends nearer to the target.
     """
-    world = rollout.observed[OBSERVED]
+    world = rollout.observed[scenes.OBSERVED]
     to_target, to_distractor = _to_each(goal, world[..., :3], world[:, 0])
-    touched = (to_distractor < REACH).any(dim=1)
-    return {"success": (to_target[:, -1] < REACH) & ~touched, "distractor": touched, "progress": to_target[:, -1] < to_target[:, 0]}
+    end, touched = to_target[:, -1], (to_distractor < scenes.REACH).any(dim=1)
+    return {"success": (end < scenes.REACH) & ~touched, "distractor": touched, "progress": end < to_target[:, 0]}
 
 
 def _encode_steps(states: Tensor, observed: Observed) -> Tensor:
     """Difference of each state ``(sample, horizon, 13)`` from the preceding state; the first from the present."""
-    return torch.diff(states, dim=1, prepend=observed[OBSERVED][:, None, :STATE])
+    return torch.diff(states, dim=1, prepend=observed[scenes.OBSERVED][:, None, : scenes.STATE])
 
 
 def _decode_steps(steps: Tensor, observed: Observed) -> Tensor:
     """Inverse of :func:`_encode_steps`."""
     # Not cumsum, which has no deterministic form on GPUs.
-    return torch.stack(list(itertools.accumulate(steps.unbind(dim=1), initial=observed[OBSERVED][:, :STATE]))[1:], dim=1)
+    present = observed[scenes.OBSERVED][:, : scenes.STATE]
+    return torch.stack(list(itertools.accumulate(steps.unbind(dim=1), initial=present))[1:], dim=1)
 
 
 def act(plans: Tensor, step: int, observed: Observed) -> Tensor:
@@ -108,49 +96,49 @@ def act(plans: Tensor, step: int, observed: Observed) -> Tensor:
         step: steps since the plan was made.
         observed: ``world (episode, 52)``.
     """
-    ahead = plans[:, min(step + LOOKAHEAD, plans.shape[1] - 1)]
-    return (ahead - observed[OBSERVED][:, :STATE])[:, list(PLANE)]
+    ahead = plans[:, min(step + scenes.LOOKAHEAD, plans.shape[1] - 1)]
+    return (ahead - observed[scenes.OBSERVED][:, : scenes.STATE])[:, list(scenes.PLANE)]
 
 
 def _straight(world: Tensor, chosen: Tensor) -> Tensor:
     """Plans ``(scene, horizon, 13)`` straight to the chosen object, at the expert's speed."""
-    objects = object_positions(world)
+    objects = scenes.object_positions(world)
     goal = objects[torch.arange(len(objects)), chosen]
     start = world[:, None, :3]
     way = (goal - world[:, :3])[:, None]
     length = torch.linalg.vector_norm(way, dim=-1, keepdim=True)
-    driven = torch.minimum(torch.arange(HORIZON)[None, :, None] * STEP * SPEED, length)
-    plans = world[:, None, :STATE].repeat(1, HORIZON, 1)
+    driven = torch.minimum(torch.arange(HORIZON)[None, :, None] * scenes.STEP * SPEED, length)
+    plans = world[:, None, : scenes.STATE].repeat(1, HORIZON, 1)
     plans[..., :3] = start + way * driven / length
     return plans
 
 
 def _nearest(goal: str, count: int, starts: InitialStates | None, seed: int) -> Tensor:
-    world = check_starts(starts).observed[OBSERVED]
-    away = torch.linalg.vector_norm(object_positions(world) - world[:, None, :3], dim=-1)
+    world = check_starts(starts).observed[scenes.OBSERVED]
+    away = torch.linalg.vector_norm(scenes.object_positions(world) - world[:, None, :3], dim=-1)
     return _straight(world, away.argmin(dim=1))
 
 
 def _random(goal: str, count: int, starts: InitialStates | None, seed: int) -> Tensor:
-    world = check_starts(starts).observed[OBSERVED]
+    world = check_starts(starts).observed[scenes.OBSERVED]
     draw = torch.Generator().manual_seed(seed)
     return _straight(world, torch.randint(2, (len(world),), generator=draw))
 
 
 def _oracle(goal: str, count: int, starts: InitialStates | None, seed: int) -> Tensor:
-    env, world = environment(), check_starts(starts).observed[OBSERVED]
+    env, world = environment(), check_starts(starts).observed[scenes.OBSERVED]
     drives = [
         torch.from_numpy(demonstrate(env, state, chosen))
-        for state, chosen in zip(world.numpy(), target(goal, world).tolist(), strict=True)
+        for state, chosen in zip(world.numpy(), scenes.target(goal, world).tolist(), strict=True)
     ]
     env.close()
     rows = torch.arange(HORIZON)
-    return torch.stack([drive[rows.clamp(max=len(drive) - 1), :STATE] for drive in drives])
+    return torch.stack([drive[rows.clamp(max=len(drive) - 1), : scenes.STATE] for drive in drives])
 
 
 def _from_start(states: Tensor) -> Tensor:
     """Paths ``(plan, horizon, 2)`` in the plane, relative to their start."""
-    paths = states[..., list(PLANE)]
+    paths = states[..., list(scenes.PLANE)]
     return paths - paths[:, :1]
 
 
@@ -169,21 +157,23 @@ DOMAIN = Domain(
         training=TRAINING_CONCEPTS, suites=SUITES, reads=reads, table=Path(__file__).parent / "embeddings.safetensors"
     ),
     source=lambda root: Expert(),
-    observed={OBSERVED: FEATURE},
+    observed={scenes.OBSERVED: scenes.FEATURE},
     metrics={ACCURACY: Metric(progressed)},
     show=Show(deferred(f"{RENDERING}:render"), vector_film=deferred(f"{RENDERING}:plan_film")),
     views={
         # Autoregressive methods need not copy the state, which changes by about 1% per step.
-        "steps": View({OBSERVED: FEATURE}, observe=lambda observed: observed, encode=_encode_steps, decode=_decode_steps)
+        "steps": View(
+            {scenes.OBSERVED: scenes.FEATURE}, observe=lambda observed: observed, encode=_encode_steps, decode=_decode_steps
+        )
     },
     closed_loop=ClosedLoop(
         environment=environment,
         act=act,
-        steps=MAX_STEPS,
+        steps=scenes.MAX_STEPS,
         judge=reached,
         film=deferred(f"{RENDERING}:film"),
         vector_film=deferred(f"{RENDERING}:vector_film"),
-        expect=check_simulator,
+        expect=scenes.check_simulator,
     ),
     comparison=Comparison(
         headline="closed loop success",

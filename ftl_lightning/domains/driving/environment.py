@@ -9,21 +9,9 @@ import torch
 from highway_env.envs.common.abstract import AbstractEnv
 from numpy.typing import NDArray
 
+from ftl_lightning.domains.driving import traffic
 from ftl_lightning.domains.driving.foresight import VETOES, Beliefs, Worlds
 from ftl_lightning.domains.driving.scenarios import SCENARIOS, advance, arrived, make, observe
-from ftl_lightning.domains.driving.traffic import (
-    BELIEF,
-    FEATURES_SEEN,
-    MAX_STEPS,
-    NAMES,
-    OBSERVED,
-    SCENARIO,
-    SEEDS,
-    STATE,
-    TRAFFIC,
-    origin,
-    scene,
-)
 from ftl_lightning.domains.driving.views import drive
 from ftl_lightning.services.errors import require
 
@@ -56,11 +44,11 @@ class DrivingEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
     metadata = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012 (gymnasium's)
     render_mode = "rgb_array"
     observation_space: gymnasium.spaces.Space[Any] = gymnasium.spaces.Dict(
-        {name: gymnasium.spaces.Box(-np.inf, np.inf, feature.shape, np.float32) for name, feature in FEATURES_SEEN.items()}
+        {name: gymnasium.spaces.Box(-np.inf, np.inf, feature.shape, np.float32) for name, feature in traffic.FEATURES_SEEN.items()}
     )
-    action_space = gymnasium.spaces.Box(-np.inf, np.inf, (STATE,), np.float32)
+    action_space = gymnasium.spaces.Box(-np.inf, np.inf, (traffic.STATE,), np.float32)
 
-    def __init__(self, veto: str = BELIEF) -> None:
+    def __init__(self, veto: str = traffic.BELIEF) -> None:
         require(veto in VETOES, "driving veto", f"one of {', '.join(VETOES)}", repr(veto))
         self.veto = veto
         self._name = ""
@@ -78,9 +66,9 @@ class DrivingEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         options = options or {}
         given = options.get("scene")
         if given is None:
-            name, start = options.get("task", "roundabout"), int(self.np_random.integers(SEEDS))
+            name, start = options.get("task", "roundabout"), int(self.np_random.integers(traffic.SEEDS))
         else:
-            name, start = origin(np.asarray(given))
+            name, start = traffic.origin(np.asarray(given))
         if name != self._name:
             self.simulation, self._name = make(name), name
         super().reset(seed=start)  # for ties between decisions
@@ -88,27 +76,27 @@ class DrivingEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         self._seed, self._return, self._length = start, 0.0, 0
         self._beliefs = Beliefs(self.simulation, name)
         seen = observe(self.simulation)
-        same = given is None or np.allclose(scene(seen, name, start), given, atol=1e-3)
+        same = given is None or np.allclose(traffic.scene(seen, name, start), given, atol=1e-3)
         expected = f"the initial state of {name!r} for seed {start}"
         require(same, "driving scene", expected, "another; an episode cannot start in the middle of a drive")
         return self.observation(), {}
 
     def observation(self) -> Seen:
         """Current observation."""
-        number = np.array([NAMES.index(self._name)], dtype=np.float32)
-        return {TRAFFIC: observe(self.simulation).reshape(OBSERVED).astype(np.float32), SCENARIO: number}
+        number = np.array([traffic.NAMES.index(self._name)], dtype=np.float32)
+        return {traffic.TRAFFIC: observe(self.simulation).reshape(traffic.OBSERVED).astype(np.float32), traffic.SCENARIO: number}
 
     def step(self, action: NDArray[np.float32]) -> tuple[Seen, float, bool, bool, dict[str, Any]]:
         """Take a decision and simulate until the next."""
         wish = np.asarray(action, dtype=np.float64)
-        numbers = wish.shape in ((STATE,), (DRIVE,), (1,)) and np.isfinite(wish).all()
-        require(numbers, "driving action", f"{STATE} finite numbers, {DRIVE} or 1", wish.tolist())
+        numbers = wish.shape in ((traffic.STATE,), (DRIVE,), (1,)) and np.isfinite(wish).all()
+        require(numbers, "driving action", f"{traffic.STATE} finite numbers, {DRIVE} or 1", wish.tolist())
         chosen = self.decide(wish)
         reward, ended = advance(self.simulation, chosen)
         self._return += reward
         self._length += 1
-        info = self._outcome() if ended or self._length >= MAX_STEPS else {}
-        return self.observation(), reward, ended, self._length >= MAX_STEPS, info
+        info = self._outcome() if ended or self._length >= traffic.MAX_STEPS else {}
+        return self.observation(), reward, ended, self._length >= traffic.MAX_STEPS, info
 
     def decide(self, wish: NDArray[np.float64]) -> int:
         """Return the decision of minimum risk nearest to an action, see the class; the simulation is left unchanged."""

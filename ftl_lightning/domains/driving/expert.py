@@ -18,25 +18,9 @@ from highway_env.envs.common.abstract import AbstractEnv
 from numpy.typing import NDArray
 
 from ftl_lightning.data.demonstrations import Demonstrations
+from ftl_lightning.domains.driving import traffic
 from ftl_lightning.domains.driving.foresight import FRAMES, VETOES, Beliefs, Worlds, meaning
 from ftl_lightning.domains.driving.scenarios import SCENARIOS, Snapshot, advance, arrived, make, observe, restore, save
-from ftl_lightning.domains.driving.traffic import (
-    BELIEF,
-    FEATURES_SEEN,
-    HORIZON,
-    NAME,
-    NAMES,
-    OBSERVED,
-    SCENARIO,
-    STATE,
-    STATE_NAMES,
-    STATE_UNITS,
-    TRAFFIC,
-    VEHICLES,
-    decision_seconds,
-    episode_seed,
-    scene,
-)
 from ftl_lightning.services.errors import UserError, require
 from ftl_lightning.services.tensor_file import cache_folder, content_hash, load_tensors, save_tensors
 
@@ -62,7 +46,7 @@ class Search:
     sight: float = math.inf
 
 
-SEARCH = dict.fromkeys(NAMES, Search(75, 0.9)) | {
+SEARCH = dict.fromkeys(traffic.NAMES, Search(75, 0.9)) | {
     "highway": Search(75, 0.7, sight=200),
     "exit": Search(200, 0.85, frequency=5, sight=120),
     "merge": Search(75, 0.7, frequency=5),
@@ -123,7 +107,7 @@ def plan_blind(env: AbstractEnv, name: str, beliefs: Beliefs, rng: np.random.Gen
             beliefs.draw(rng)
             for action in actions:
                 totals[action] += _values(env, name, search, [action], BLIND.expansions * len(actions))[action]
-    worlds = Worlds(env, VETOES[BELIEF], beliefs, rng)
+    worlds = Worlds(env, VETOES[traffic.BELIEF], beliefs, rng)
     risks: dict[int, float] = {}
     for action in sorted(actions, key=lambda action: -totals[action]):
         risks[action] = worlds.risk(action)
@@ -207,9 +191,9 @@ MOST = 4
 
 def shard(name: str, seed: int, blind: bool = False) -> Path:
     """Cache file of an episode."""
-    belief = [BLIND.__dict__, VETOES[BELIEF].__dict__] if blind else []
+    belief = [BLIND.__dict__, VETOES[traffic.BELIEF].__dict__] if blind else []
     key = content_hash([name, SCENARIOS[name].config, SEARCH[name].__dict__, *belief])
-    return cache_folder() / f"{NAME}-{key}" / f"{seed}.safetensors"
+    return cache_folder() / f"{traffic.NAME}-{key}" / f"{seed}.safetensors"
 
 
 def episode(name: str, seed: int, blind: bool = False) -> tuple[np.ndarray, bool]:
@@ -233,7 +217,7 @@ def episode(name: str, seed: int, blind: bool = False) -> tuple[np.ndarray, bool
         raise UserError(f"driving {name!r}, seed {seed}: the machine failed ({error!r}); run it again, it goes on here") from error
     except Exception as error:  # errors of the simulation: continue with further episodes
         _LOG.warning("driving %r, seed %d: %r; the episode counts as rejected and is not kept", name, seed, error)
-        return np.zeros((1, VEHICLES, STATE), dtype=np.float32), False
+        return np.zeros((1, traffic.VEHICLES, traffic.STATE), dtype=np.float32), False
     save_tensors(path, KIND, {"observations": torch.from_numpy(seen)}, {"succeeded": succeeded})
     return seen, succeeded
 
@@ -243,7 +227,7 @@ def driven_on(seen: np.ndarray, name: str, length: int) -> np.ndarray:
 
     Plans extend beyond the end of an episode. Padding with standing vehicles would teach that episodes end with a stop.
     """
-    times = decision_seconds(name) * np.arange(1, length - len(seen) + 1)[:, None, None]
+    times = traffic.decision_seconds(name) * np.arange(1, length - len(seen) + 1)[:, None, None]
     beyond = np.repeat(seen[-1:], len(times), axis=0)
     beyond[..., 1:3] += (times * beyond[..., 3:5]).astype(np.float32)
     return np.concatenate((seen, beyond))
@@ -271,7 +255,7 @@ def demonstrations(
     """
     kept: list[tuple[int, np.ndarray]] = []
     driven = 0
-    seeds = [episode_seed(seed, number) for number in range(MOST * count)]
+    seeds = [traffic.episode_seed(seed, number) for number in range(MOST * count)]
     for driven, (seen, succeeded) in enumerate(_episodes(name, seeds, workers, blind), start=1):
         if succeeded:
             kept.append((seeds[driven - 1], seen))
@@ -279,20 +263,20 @@ def demonstrations(
         if len(kept) == count:
             break
     require(len(kept) == count, f"driving {name!r}", f"{count} successful episodes of {driven}", len(kept))
-    longest = max(len(seen) for _, seen in kept) + HORIZON
+    longest = max(len(seen) for _, seen in kept) + traffic.HORIZON
     seen = np.stack([driven_on(seen, name, longest) for _, seen in kept])
-    traffic = torch.from_numpy(seen).float().flatten(2)
-    scenes = torch.from_numpy(np.stack([scene(seen[0], name, start) for start, seen in kept]))
-    provenance = {"generator": NAME, "seed": seed, "count": count, "driven": driven, "rejected": driven - count}
+    vehicles = torch.from_numpy(seen).float().flatten(2)
+    scenes = torch.from_numpy(np.stack([traffic.scene(seen[0], name, start) for start, seen in kept]))
+    provenance = {"generator": traffic.NAME, "seed": seed, "count": count, "driven": driven, "rejected": driven - count}
     return Demonstrations(
-        states=traffic[..., :STATE].contiguous(),
+        states=vehicles[..., : traffic.STATE].contiguous(),
         lengths=torch.tensor([len(seen) for _, seen in kept]),
-        domain=NAME,
-        state_names=STATE_NAMES,
-        state_units=STATE_UNITS,
+        domain=traffic.NAME,
+        state_names=traffic.STATE_NAMES,
+        state_units=traffic.STATE_UNITS,
         concepts=(name,) * count,
-        observed={TRAFFIC: traffic, SCENARIO: scenes[:, None, OBSERVED : OBSERVED + 1].repeat(1, longest, 1)},
-        per_step=tuple(FEATURES_SEEN),
+        observed={traffic.TRAFFIC: vehicles, traffic.SCENARIO: scenes[:, None, [traffic.OBSERVED]].repeat(1, longest, 1)},
+        per_step=tuple(traffic.FEATURES_SEEN),
         scenes=scenes,
         provenance=provenance | ({"expert": "blind"} if blind else {}),
     )
