@@ -15,27 +15,21 @@ from ftl_lightning.services.errors import UserError, require
 BOWL_THICKNESS = 0.025
 FLOOR = [2.2, 0.01, 1.1]
 """Half extents of the drawn floor."""
-IMAGE = (200, 320)
-"""Height and width of a rendered picture."""
+IMAGE = (200, 320)  # height and width of a rendered picture
 Seen = dict[str, NDArray[np.float32]]
 """Observed features by name."""
 Mesh = tuple[list[list[float]], list[int]]
-"""Vertices ``[x, y, z]`` in metres, y up, and triangles as a flat list of vertex indices, counter-clockwise from outside."""
-SEGMENTS = 24
-"""Segments of a full turn of a mesh."""
+"""Vertices ``[x, y, z]``, y up, and triangles as a flat list of vertex indices, counter-clockwise from outside."""
+RINGS = 6  # of each surface of a bowl
+SEGMENTS = 24  # of a full turn of a mesh
 
 
 def revolve(profile: Sequence[tuple[float, float]]) -> Mesh:
-    """Rotate a closed profile around the y axis.
-
-    Args:
-        profile: ``(radius, y)`` from the lower pole to the upper one along the outside of the body; both ends on the axis.
+    """Rotate a profile ``(radius, y)`` around the y axis, from the lower pole to the upper along the outside; both ends on the
+    axis.
     """
-    vertices: list[list[float]] = []
-    for radius, y in profile:
-        for step in range(SEGMENTS):
-            angle = 2 * math.pi * step / SEGMENTS
-            vertices.append([radius * math.sin(angle), y, radius * math.cos(angle)])
+    angles = [2 * math.pi * step / SEGMENTS for step in range(SEGMENTS)]
+    vertices = [[radius * math.sin(angle), y, radius * math.cos(angle)] for radius, y in profile for angle in angles]
     triangles: list[int] = []
     for ring in range(len(profile) - 1):
         for step in range(SEGMENTS):
@@ -50,17 +44,10 @@ def cone(radius: float, half_height: float) -> Mesh:
     return revolve([(0.0, -half_height), (radius, -half_height), (0.0, half_height)])
 
 
-def bowl(radius: float, half_height: float, thickness: float, rings: int = 6) -> Mesh:
-    """Concave open shell between two half ellipsoids.
-
-    Args:
-        radius: outer radius of the rim.
-        half_height: half the height; the centre is at half the height.
-        thickness: thickness of the wall.
-        rings: rings of each surface.
-    """
+def bowl(radius: float, half_height: float, thickness: float) -> Mesh:
+    """Concave open shell between two half ellipsoids, centred at half its height, with its rim's outer radius."""
     height = 2 * half_height
-    angles = [math.pi / 2 * ring / rings for ring in range(rings + 1)]
+    angles = [math.pi / 2 * ring / RINGS for ring in range(RINGS + 1)]
     outside = [(radius * math.sin(a), half_height - height * math.cos(a)) for a in angles]
     inside = [((radius - thickness) * math.sin(a), half_height - (height - thickness) * math.cos(a)) for a in reversed(angles)]
     return revolve([*outside, *inside])
@@ -73,9 +60,9 @@ class AgentEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
     """Environment with an agent and two objects.
 
     An observation is an initial state (52 numbers, :mod:`ftl_lightning.domains.agent.scenes`). An action is a force in newtons
-    along x and z, applied for :data:`STEP` seconds. The agent slides without friction, is slowed by drag, and neither tips nor
-    turns. Reaching an object (centres within :data:`REACH`) terminates an episode, :data:`MAX_STEPS` steps truncate it; further
-    steps are possible. Every instance has a separate simulator without a display.
+    along x and z, applied for ``STEP`` seconds. The agent slides without friction, is slowed by drag, and neither tips nor turns.
+    Reaching an object terminates an episode, ``MAX_STEPS`` steps truncate it; further steps are possible. Every instance has a
+    separate simulator without a display.
 
     Raises:
         UserError: if the simulator does not start.
@@ -98,11 +85,7 @@ class AgentEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         self._steps = 0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Seen, dict[str, Any]]:
-        """Build a scene.
-
-        Args:
-            seed: seed of the drawn scene if none is given.
-            options: ``scene``, 52 numbers; or ``task``, to draw a scene of it (default 'go to red object').
+        """Build a scene: ``options['scene']``, 52 numbers, or one drawn for ``options['task']`` (default 'go to red object').
 
         Raises:
             UserError: for a scene of the wrong size, with overlapping bodies, or with numbers that are not finite.
@@ -174,7 +157,7 @@ class AgentEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         return {scenes.OBSERVED: observation}
 
     def step(self, action: NDArray[np.float32]) -> tuple[Seen, float, bool, bool, dict[str, Any]]:
-        """Apply a force for :data:`STEP` seconds. The reward is 0, as the environment does not know the task.
+        """Apply a force for ``STEP`` seconds; the reward is 0.
 
         Raises:
             UserError: for an action of the wrong size or with numbers that are not finite.

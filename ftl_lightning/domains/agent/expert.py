@@ -21,10 +21,8 @@ if TYPE_CHECKING:
     from ftl_lightning.domains.agent.environment import AgentEnvironment
 
 NAME = "agent"
-STATE_NAMES = tuple(
-    f"agent.{column}"
-    for column in ("x", "y", "z", "qx", "qy", "qz", "qw", "vx", "vy", "vz", "angular vx", "angular vy", "angular vz")
-)
+_COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw", "vx", "vy", "vz", "angular vx", "angular vy", "angular vz")
+STATE_NAMES = tuple(f"agent.{column}" for column in _COLUMNS)
 STATE_UNITS = ("m",) * 3 + ("1",) * 4 + ("m/s",) * 3 + ("rad/s",) * 3
 LENGTH = 150
 """States of a demonstration, padded with the last state (paper)."""
@@ -33,19 +31,14 @@ SPEED = 0.4
 KEEP_CLEAR = 0.5
 """Minimum distance of the route from the distractor's centre in metres."""
 STOP = 0.26
-"""Distance of the end of the route from the target's centre in metres, just before contact."""
+"""Distance of the route's end from the target's centre in metres, just before contact."""
 AT_REST = 0.02
 """Speed in m/s below which the agent is at rest."""
 
 _PHYSICS = ("STEP", "SUBSTEPS", "DRAG", "MASS", "MAX_FORCE", "RADIUS", "LOOKAHEAD", "MARGIN", "COLOURS", "SHAPES")
 _LAYOUT = ("AGENT_START", "OBJECT_X", "OBJECT_Z", "AGENT_CLEARANCE", "OBJECT_CLEARANCE")
-_SETTINGS = {name: getattr(scenes, name) for name in (*_PHYSICS, *_LAYOUT)} | {
-    "LENGTH": LENGTH,
-    "SPEED": SPEED,
-    "KEEP_CLEAR": KEEP_CLEAR,
-    "STOP": STOP,
-    "AT_REST": AT_REST,
-}
+_PACE = {"LENGTH": LENGTH, "SPEED": SPEED, "KEEP_CLEAR": KEEP_CLEAR, "STOP": STOP, "AT_REST": AT_REST}
+_SETTINGS = {name: getattr(scenes, name) for name in (*_PHYSICS, *_LAYOUT)} | _PACE
 """Settings that determine demonstrations besides task, count and seed (cache key)."""
 
 Plane = NDArray[np.float64]
@@ -77,12 +70,8 @@ def along(corners: Plane, distance: float) -> Plane:
 
 
 def demonstrate(env: "AgentEnvironment", initial: NDArray[np.float32], chosen: int) -> NDArray[np.float32]:
-    """Observations ``(time, 52)`` of a drive, ``time`` at most :data:`LENGTH`.
-
-    Args:
-        env: environment; it is reset.
-        initial: ``(52,)``.
-        chosen: 0 or 1, the object to drive to.
+    """Observations ``(time, 52)`` of a drive to object 0 or 1 of a scene ``(52,)``, at most :data:`LENGTH`; resets the
+    environment.
     """
     objects = scenes.object_positions(torch.from_numpy(initial)[None])[0].double().numpy()[:, scenes.PLANE]
     place = initial[list(scenes.PLANE)].astype(np.float64)
@@ -90,12 +79,9 @@ def demonstrate(env: "AgentEnvironment", initial: NDArray[np.float32], chosen: i
 
 
 def follow(env: "AgentEnvironment", initial: NDArray[np.float32], corners: Plane) -> NDArray[np.float32]:
-    """Observations ``(time, 52)`` of a drive along a route at the expert's speed, until rest at its end.
+    """Observations ``(time, 52)`` of a drive along a route ``(corner, 2)`` at the expert's speed, until rest at its end.
 
-    Args:
-        env: environment; it is reset.
-        initial: ``(52,)``.
-        corners: corners of the route ``(2 or more, 2)`` in x and z; the drive is cut at :data:`LENGTH` states.
+    The environment is reset; the drive is cut at :data:`LENGTH` states.
     """
     observation = env.reset(options={"scene": initial})[0][scenes.OBSERVED]
     seen = [observation]
@@ -110,11 +96,7 @@ def follow(env: "AgentEnvironment", initial: NDArray[np.float32], corners: Plane
 
 
 def environment() -> "AgentEnvironment":
-    """Environment of the domain.
-
-    Raises:
-        UserError: without the simulator, or if it does not start.
-    """
+    """Environment of the domain; raises a ``UserError`` without the simulator, or if it does not start."""
     scenes.check_simulator()
     from ftl_lightning.domains.agent.environment import AgentEnvironment
 
@@ -123,21 +105,12 @@ def environment() -> "AgentEnvironment":
 
 def demonstrations(tasks: tuple[str, ...], count: int, seed: int) -> Demonstrations:
     """``count`` expert drives of each task, from the cache if present."""
-    return cached(
-        {"domain": NAME, "tasks": tasks, "count": count, "seed": seed, **_SETTINGS},
-        len(tasks) * count,
-        lambda progress: _drive(tasks, count, seed, progress),
-    )
+    settings = {"domain": NAME, "tasks": tasks, "count": count, "seed": seed, **_SETTINGS}
+    return cached(settings, len(tasks) * count, lambda progress: _drive(tasks, count, seed, progress))
 
 
 def _drive(tasks: tuple[str, ...], count: int, seed: int, progress: Callable[[], None]) -> Demonstrations:
-    """Drive in new scenes.
-
-    Args:
-        tasks: see :func:`~ftl_lightning.domains.agent.scenes.parse`.
-        count, seed: number and seed of each task's scenes.
-        progress: called after each drive.
-    """
+    """Drive in new scenes; ``progress`` is called after each drive."""
     initial = [scenes.scenes(task, count, seed) for task in tasks]
     chosen = torch.cat([scenes.target(task, states) for task, states in zip(tasks, initial, strict=True)])
     env, driven = environment(), []
