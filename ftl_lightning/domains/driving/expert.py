@@ -34,8 +34,7 @@ class Search:
     Attributes:
         budget: simulated decisions per decision taken.
         gamma: discount; rewards are in [0, 1].
-        frequency: simulation frequency during search in Hz.
-        hold: steps per decision during search.
+        frequency, hold: simulation frequency in Hz and steps per decision during search.
         sight: distance in metres; farther vehicles are ignored during search.
     """
 
@@ -77,26 +76,20 @@ BLIND = Blind()
 def plan(env: AbstractEnv, name: str) -> int:
     """Return the next action; the environment is left unchanged.
 
-    A tree of action sequences grows at the leaf of highest optimistic value: its discounted return plus the maximum future reward,
-    1 per step. Once the budget is spent, the first action of the sequence with the highest return is taken.
+    A tree of action sequences grows at the leaf of highest optimistic value, its discounted return plus the maximum future reward,
+    until the budget is spent. The first action of the sequence with the highest return is taken.
     """
     search = SEARCH[name]
     with _searching(env, search):
         values = _values(env, name, search, env.get_available_actions(), search.budget)
-    return max(values, key=lambda action: values[action], default=IDLE)
+    return max(values, key=values.__getitem__, default=IDLE)
 
 
 def plan_blind(env: AbstractEnv, name: str, beliefs: Beliefs, rng: np.random.Generator) -> int:
-    """Return the next action of the blind expert; the environment is left unchanged.
+    """Return the next action of the blind expert, which searches sampled worlds; the environment is left unchanged.
 
-    The expert searches sampled worlds with the planner's veto. The value of an action is the mean return of its best sequence over
-    the worlds. The best action of tolerated risk is taken, else the best action of minimum risk.
-
-    Args:
-        env: the simulation.
-        name: name of the scenario.
-        beliefs: beliefs, updated for this decision.
-        rng: generator for sampled worlds.
+    The value of an action is the mean return of its best sequence over the worlds. The best action of tolerated risk is taken, else
+    the best action of minimum risk. Beliefs must be updated for this decision.
     """
     search, actual = SEARCH[name], save(env)
     actions = list({meaning(env, action): action for action in env.get_available_actions()[::-1]}.values())[::-1]
@@ -167,11 +160,7 @@ def _values(env: AbstractEnv, name: str, search: Search, first_actions: Sequence
 
 
 def drive(name: str, seed: int, env: AbstractEnv | None = None, blind: bool = False) -> tuple[NDArray[np.float32], bool]:
-    """Run an episode of the expert.
-
-    Returns:
-        Observations ``(time, 5, 7)``, and success: at the destination without a crash.
-    """
+    """Observations ``(time, 5, 7)`` of an episode of the expert, and success: at the destination without a crash."""
     env = env or make(name)
     env.reset(seed=seed)
     seen, ended = [observe(env)], False
@@ -185,8 +174,7 @@ def drive(name: str, seed: int, env: AbstractEnv | None = None, blind: bool = Fa
 
 
 KIND = "driving episode"
-MOST = 4
-"""Maximum number of episodes driven per kept episode."""
+MOST = 4  # episodes driven per kept episode
 
 
 def shard(name: str, seed: int, blind: bool = False) -> Path:
@@ -199,7 +187,7 @@ def shard(name: str, seed: int, blind: bool = False) -> Path:
 def episode(name: str, seed: int, blind: bool = False) -> tuple[np.ndarray, bool]:
     """Observations ``(time, 5, 7)`` and success of an expert episode, from the cache if present.
 
-    If the simulation raises an error, the episode counts as rejected and is not cached.
+    An error of the simulation rejects the episode, which is not cached.
 
     Raises:
         UserError: if the machine fails, independently of the episode.
@@ -223,9 +211,8 @@ def episode(name: str, seed: int, blind: bool = False) -> tuple[np.ndarray, bool
 
 
 def driven_on(seen: np.ndarray, name: str, length: int) -> np.ndarray:
-    """Extend observations ``(time, 5, 7)`` to ``length``: vehicles drive straight on after the end.
-
-    Plans extend beyond the end of an episode. Padding with standing vehicles would teach that episodes end with a stop.
+    """Extend observations ``(time, 5, 7)`` to ``length``, straight on: standing vehicles would teach that episodes end with a
+    stop.
     """
     times = traffic.decision_seconds(name) * np.arange(1, length - len(seen) + 1)[:, None, None]
     beyond = np.repeat(seen[-1:], len(times), axis=0)
@@ -237,8 +224,7 @@ def _episodes(name: str, seeds: list[int], workers: int, blind: bool) -> Iterato
     run = partial(episode, name, blind=blind)
     if workers == 1:
         yield from map(run, seeds)
-        return
-    # Only this process handles Ctrl-C; it then ends the workers.
+        return  # below, only this process handles Ctrl-C; it then ends the workers
     with multiprocessing.get_context("spawn").Pool(workers, signal.signal, (signal.SIGINT, signal.SIG_IGN)) as pool:
         yield from pool.imap(run, seeds)
 
@@ -246,9 +232,7 @@ def _episodes(name: str, seeds: list[int], workers: int, blind: bool) -> Iterato
 def demonstrations(
     name: str, count: int, seed: int, workers: int, progress: Callable[[], None], blind: bool = False
 ) -> Demonstrations:
-    """The first ``count`` successful episodes of a scenario in order of their seeds, for any number of workers.
-
-    ``progress`` is called after each successful episode.
+    """The first ``count`` successful episodes of a scenario in order of their seeds; ``progress`` is called after each.
 
     Raises:
         UserError: if too few episodes succeed.
