@@ -28,9 +28,7 @@ if TYPE_CHECKING:
     from ftl_lightning.domains.driving.environment import DrivingEnvironment
 
 Make = Callable[[str, InitialStates, Demonstrations | None, int], Policy | None]
-SHOWN = 100
-"""Demonstrations per training scenario for the look-up and the regressions."""
-MLP_STEPS = 400
+SHOWN = 100  # demonstrations per training scenario for the look-up and the regressions
 
 
 def _simulation(goal: str) -> "AbstractEnv":
@@ -74,11 +72,7 @@ def _nearest(goal: str, starts: InitialStates, demonstrations: Demonstrations | 
 
 
 def _regression(fit: Callable[[Tensor, Tensor, torch.Generator], Callable[[Tensor], Tensor]]) -> Make:
-    """Predict drives ``(n, 4)`` from the models' view of the observations.
-
-    Args:
-        fit: ``(inputs (n, 35), drives (n, 4), generator) -> prediction``, both arguments standardised.
-    """
+    """Predict drives ``(n, 4)`` from the models' view ``(n, 35)``; ``fit`` receives both standardised, and a generator."""
 
     def policy(goal: str, starts: InitialStates, demonstrations: Demonstrations | None, seed: int) -> Policy:
         seen, following = _transitions(goal, demonstrations)
@@ -115,7 +109,7 @@ def _mlp(inputs: Tensor, drives: Tensor, draw: torch.Generator) -> Callable[[Ten
             layers += [weight.requires_grad_(), torch.zeros(after, requires_grad=True)]
         inputs, drives = inputs.clone(), drives.clone()
         optimizer = torch.optim.AdamW(layers, lr=3e-3, weight_decay=0.1)
-        for _ in range(MLP_STEPS):
+        for _ in range(400):
             optimizer.zero_grad()
             (predict(inputs) - drives).square().mean().backward()
             optimizer.step()
@@ -143,17 +137,12 @@ POLICIES = {
     "expert (oracle)": _expert,
 }
 """Baseline policies by name; all are subject to the planner's veto."""
-
-
 RENDERING = "ftl_lightning.domains.driving.rendering"
 
 
 class Expert:
-    """Source of successful episodes of the expert: shipped or new.
-
-    Args:
-        root: folder of user episodes of the training scenarios, instead of the shipped episodes.
-        blind: whether new episodes are of the expert that knows only observations.
+    """Source of successful episodes of the expert: shipped ones, those in ``root``, or new ones; blind: it knows only
+    observations.
     """
 
     def __init__(self, root: Path | None = None, blind: bool = False) -> None:
@@ -196,11 +185,11 @@ def environment(veto: str = traffic.BELIEF) -> "DrivingEnvironment":
 
 
 def judge(goal: str, rollout: Rollout) -> dict[str, Tensor]:
-    """Outcomes of episodes.
+    """Outcomes of episodes ``(episode,)``, 0 for an aborted episode.
 
-    Returns:
-        ``(episode,)`` each: ``success``, the paper's criterion (roundabout: past it, crashed or not); ``strict success``, on the
-        right road without a crash; ``crash``; ``return``; ``length`` in steps. All are 0 for an aborted episode.
+    ``success`` is the paper's criterion (roundabout: past it, crashed or not), ``strict success`` on the right road without a
+    crash;
+    ``crash``, ``return``, and ``length`` in steps.
     """
     columns = {"success": "passed", "strict success": "arrived", "crash": "crashed", "return": "return", "length": "length"}
     outcomes = {name: torch.tensor([float(info.get(key, 0)) for info in rollout.infos]) for name, key in columns.items()}
@@ -208,10 +197,9 @@ def judge(goal: str, rollout: Rollout) -> dict[str, Tensor]:
 
 
 def distance(states: Tensor, others: Tensor) -> Tensor:
-    """Root mean square distance ``(a, b)`` in metres between paths of the controlled vehicle, relative to their initial poses."""
+    """Root mean square distance ``(a, b)`` in metres between paths relative to their initial poses."""
 
     def path(plans: Tensor) -> Tensor:
-        """Metres ``(plan, horizon, 2)`` along and across the initial heading."""
         first = plans[:, :1]
         return turned(plans[..., 1:3] - first[..., 1:3], first[..., 5], -first[..., 6])
 

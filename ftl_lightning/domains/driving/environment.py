@@ -15,29 +15,23 @@ from ftl_lightning.domains.driving.scenarios import SCENARIOS, advance, arrived,
 from ftl_lightning.domains.driving.views import drive
 from ftl_lightning.services.errors import require
 
-DRIVE = 4
-"""Columns of a drive."""
-Seen = dict[str, NDArray[np.float32]]
-"""Observed features by name."""
+DRIVE = 4  # columns of a drive
+Seen = dict[str, NDArray[np.float32]]  # observed features by name
 
 
 class DrivingEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
     """Driving scenarios; scenario and seed determine the initial state.
 
-    An observation is an initial state (37 numbers). An action is the desired state of the controlled vehicle after the step
-    (7 numbers), the desired drive (4, see :func:`~ftl_lightning.domains.driving.views.drive`) for policies that do not know the
-    road, or the number of a decision of the scenario (1). The planner selects the decisions of minimum risk
-    (:mod:`ftl_lightning.domains.driving.foresight`) and takes the nearest to the action (Euclidean, raw units), at random among
-    ties; it brakes if all crash. A numbered decision of higher risk is replaced by a random decision of minimum risk.
-
-    The last step's info contains ``crashed``, ``arrived`` (at the destination without a crash), ``passed`` (criterion of the
-    paper's code), ``return`` (sum of rewards) and ``length``.
+    An observation is an initial state (37 numbers). An action is the desired state after the step (7 numbers), the desired drive
+    (4,
+    see :func:`~ftl_lightning.domains.driving.views.drive`) for policies that do not know the road, or the number of a decision (1).
+    The planner selects the decisions of minimum risk (:mod:`ftl_lightning.domains.driving.foresight`) and takes the nearest to the
+    action (Euclidean, raw units), at random among ties; it brakes if all crash. A numbered decision of higher risk is replaced by a
+    random decision of minimum risk. The last step's info contains ``crashed``, ``arrived`` (at the destination without a crash),
+    ``passed`` (criterion of the paper's code), ``return`` (sum of rewards) and ``length``.
 
     Args:
         veto: ``'belief'``, ``'simulation'`` or ``'step'`` (the paper's); another raises a ``UserError``.
-
-    Attributes:
-        simulation: highway-env's environment of the scenario, after the first reset.
     """
 
     simulation: AbstractEnv
@@ -50,11 +44,8 @@ class DrivingEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
 
     def __init__(self, veto: str = traffic.BELIEF) -> None:
         require(veto in VETOES, "driving veto", f"one of {', '.join(VETOES)}", repr(veto))
-        self.veto = veto
-        self._name = ""
-        self._seed = 0
-        self._return = 0.0
-        self._length = 0
+        self.veto, self._name = veto, ""
+        self._seed, self._return, self._length = 0, 0.0, 0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Seen, dict[str, Any]]:
         """Reset to the initial state of ``options['scene']``, 37 numbers, or of a random seed in the scenario ``options['task']``.
@@ -130,20 +121,13 @@ class DrivingEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         """Distances ``(decision,)`` of next states ``(decision, 7)`` after the present ``(7,)`` from the action."""
         if len(wish) == DRIVE:
             states = drive(torch.from_numpy(now).expand(len(states), -1), torch.from_numpy(states)).numpy()
-        distances: NDArray[np.float64] = np.linalg.norm(states - wish, axis=1)
-        return distances
+        return np.asarray(np.linalg.norm(states - wish, axis=1))
 
     def _outcome(self) -> dict[str, float]:
-        crashed = bool(self.simulation.vehicle.crashed)
-        there = arrived(self.simulation, self._name)
-        passed = SCENARIOS[self._name].passed
-        return {
-            "crashed": crashed,
-            "arrived": there and not crashed,
-            "passed": passed(self.simulation) if passed else there and not crashed,
-            "return": self._return,
-            "length": self._length,
-        }
+        crashed, passed = bool(self.simulation.vehicle.crashed), SCENARIOS[self._name].passed
+        there = arrived(self.simulation, self._name) and not crashed
+        outcome = {"crashed": crashed, "arrived": there, "passed": passed(self.simulation) if passed else there}
+        return outcome | {"return": self._return, "length": self._length}
 
     def render(self) -> NDArray[np.uint8]:
         """Top-view picture ``(height, width, 3)``."""
