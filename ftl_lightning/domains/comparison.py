@@ -9,14 +9,11 @@ from torch import Tensor
 from ftl_lightning.data.distances import Distance
 from ftl_lightning.data.features import InitialStates
 
-OURS = "FTL-IGM"
-"""Name of the paper's method."""
-FINE_TUNED = "LoRA fine-tuning"
-"""Baseline: learning a concept with an adapter of the whole network."""
+OURS, FINE_TUNED = "FTL-IGM", "LoRA fine-tuning"
+"""Names of the paper's method, and of the baseline that learns a concept with an adapter of the whole network."""
 WITH_MODES, WITH_KNOTS, WITH_ADAPTER, CHOSEN = "with modes", "over time", "with adapter", "form chosen"
-"""Forms of a method beyond the paper: concepts with modes, several knots or an adapter, or the form selected by leave-one-out."""
 FORMS = (WITH_MODES, WITH_KNOTS, WITH_ADAPTER, CHOSEN)
-"""Order in which forms are joined by a space: ``'with modes over time'``."""
+"""Forms of a method beyond the paper, in the order in which they are joined: ``'with modes over time'``."""
 
 
 class Compared(NamedTuple):
@@ -24,8 +21,7 @@ class Compared(NamedTuple):
 
     Attributes:
         name: such as ``'FTL-IGM'`` or ``'BC'``.
-        form: form of its concepts: some of :data:`FORMS`, or the method's description; empty for the paper's form, a single set of
-            embeddings that is constant over time.
+        form: some of :data:`FORMS`, or the method's description; empty for the paper's form, a single set of embeddings.
     """
 
     name: str
@@ -33,7 +29,6 @@ class Compared(NamedTuple):
 
 
 PAPERS_METHOD = Compared(OURS)
-"""Our method in the paper's form."""
 
 
 @dataclass(frozen=True)

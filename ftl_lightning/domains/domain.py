@@ -1,7 +1,6 @@
 """Interface of domains: a :class:`Domain` is one object, made of a few groups of fields.
 
-A domain is declared in a module of this package or of the user. Name, plans, concepts and source are required; every other field
-has a default.
+Name, plans, concepts and source are required; every other field has a default.
 """
 
 import difflib
@@ -26,12 +25,10 @@ from ftl_lightning.services.errors import UserError, require, short, shown
 from ftl_lightning.services.randomness import VALIDATION_SEED
 from ftl_lightning.services.text import Shown, counted
 
-ACCURACY = "accuracy"
-SUCCESS = "success"
+ACCURACY, SUCCESS, CLOSED = "accuracy", "success", "closed loop"
 NOVELTY, COVERAGE = "novelty", "coverage"
-"""Distances of generated plans to demonstrations, and of fresh behaviour to generated plans, see
-:mod:`ftl_lightning.evaluation.references`. They are measured in every domain; a domain's metric of this name takes precedence."""
-CLOSED = "closed loop"
+"""Distances that are measured in every domain, unless it has a metric of this name, see
+:mod:`ftl_lightning.evaluation.references`."""
 EXECUTED = f"{CLOSED} {SUCCESS}"
 Split = Literal["train", "validation"]
 _DERIVED: Any = None  # default of a field that is derived from other fields
@@ -63,11 +60,7 @@ class Plans:
     groups: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
 
     def grouped(self, names: Sequence[str]) -> tuple[int, ...]:
-        """Columns of groups.
-
-        Raises:
-            UserError: for an unknown name of a group.
-        """
+        """Columns of groups; raises a ``UserError`` for an unknown name."""
         known = f"one of {', '.join(self.groups)}" if self.groups else "no group of columns, as this domain names none"
         for name in names:
             require(name in self.groups, "compose", f"{known} after '@'", repr(name))
@@ -141,11 +134,9 @@ class Generated:
     """Source of demonstrations that a function generates from a seed, for domains without initial states.
 
     Attributes:
-        name: name of the domain.
-        plans: plans of the domain, with the columns of the states.
-        training: training concepts.
+        name, plans, training: name, plans and training concepts of the domain.
         states: ``(task, count, seed) -> (demo, time, state)`` float32, or a ``(time, state)`` per demonstration if their lengths
-            differ. The same arguments must give the same bytes.
+            differ; deterministic.
     """
 
     name: str
@@ -245,18 +236,21 @@ class Privileged:
 
 @dataclass(frozen=True)
 class Recordings:
-    """Recording and import of demonstrations.
+    """Recording and import of demonstrations, and what only those for training contain.
 
     Attributes:
         prepare: conversion of the user's copy of a data set (``python -m ftl_lightning prepare``): ``(folder to read or None,
             folder to write or None for the same) -> text to print``; ``None`` if none is needed.
         recorder: recorder of demonstrations with a pointer; ``None`` if behaviour cannot be shown in this way.
         imports: readers of other programs' files by ending, such as ``'.bvh'``: ``file -> demonstrations`` without a text.
+        privileged: quantities in training demonstrations that are not observed, by name. Pretraining can train image encoders to
+            predict them (``model.privileged``).
     """
 
     prepare: Callable[[Path | None, Path | None], str] | None = None
     recorder: Recorder | None = None
     imports: Mapping[str, Callable[[Path], Demonstrations]] = field(default_factory=dict)
+    privileged: Mapping[str, Privileged] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, repr=False)
@@ -275,9 +269,7 @@ class Domain(Shown):
         closed_loop: execution of plans; ``None`` for a domain without an environment.
         views: alternative representations of behaviour for models, by name. A model without a view sees states as they are.
         comparison: standards that results are compared with.
-        recordings: recording and import of demonstrations.
-        privileged: quantities in training demonstrations that are not observed, by name. Pretraining can train image encoders to
-            predict them (``model.privileged``).
+        recordings: recording and import of demonstrations, and what only those for training contain.
     """
 
     name: str
@@ -291,7 +283,6 @@ class Domain(Shown):
     views: Mapping[str, View] = field(default_factory=dict)
     comparison: Comparison = field(default_factory=Comparison)
     recordings: Recordings = field(default_factory=Recordings)
-    privileged: Mapping[str, Privileged] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.show is _DERIVED:
@@ -322,11 +313,6 @@ class Domain(Shown):
     def distances(self, states: Tensor, others: Tensor, distance: Distance) -> Tensor:
         """Distances ``(a, b)`` between plans ``(a, horizon, state)`` and ``(b, horizon, state)``; infinite for plans not finite.
 
-        Args:
-            states: plans.
-            others: plans of the same horizon and columns.
-            distance: the domain's distance, or its replacement.
-
         Raises:
             UserError: for plans of different shapes, or a distance that returns another shape.
         """
@@ -342,19 +328,15 @@ class Domain(Shown):
             UserError: for a domain without an environment, or a judge that returns another shape or no success.
         """
         outcomes = closed_loop_of(self).judge(goal, rollout)
-        if not isinstance(outcomes, Mapping) or SUCCESS not in outcomes:
-            found = ", ".join(outcomes) if isinstance(outcomes, Mapping) else type(outcomes).__name__
-            raise UserError(f"domain {self.name}, judge: expected outcomes by name, {SUCCESS!r} among them, found {found}")
+        found = ", ".join(outcomes) if isinstance(outcomes, Mapping) else type(outcomes).__name__
+        good = isinstance(outcomes, Mapping) and SUCCESS in outcomes
+        require(good, f"domain {self.name}, judge", f"outcomes by name, {SUCCESS!r} among them", found)
         for name, values in outcomes.items():
             _check_shape(f"domain {self.name}, outcome {name!r}", values, ((len(rollout.failed),),))
         return dict(outcomes)
 
     def check_goal(self, goal: str, key: str = "goal") -> None:
-        """Refuse a goal that the domain cannot judge.
-
-        Raises:
-            UserError: with the most similar known goals.
-        """
+        """Refuse a goal that the domain cannot judge; the ``UserError`` has the most similar known goals."""
         require(isinstance(goal, str), key, f"a text, such as {shown(self.concepts.training[0])}", shown(goal))
         if not self.concepts.reads(goal):
             known = [text for text in self.concepts.descriptions if self.concepts.reads(text)]
@@ -377,22 +359,14 @@ class Domain(Shown):
 
 
 def closed_loop_of(domain: Domain) -> ClosedLoop:
-    """Execution of plans in a domain.
-
-    Raises:
-        UserError: for a domain without an environment.
-    """
+    """Execution of plans in a domain; raises a ``UserError`` for a domain without an environment."""
     if domain.closed_loop is None:
         raise UserError(f"execute: expected a domain with an environment, found {domain.name}, which has none")
     return domain.closed_loop
 
 
 def deferred(reference: str) -> Callable[..., Any]:
-    """Function imported at its first call, such as a plot: importing matplotlib takes half a second.
-
-    Args:
-        reference: ``'package.module:function'``.
-    """
+    """Function ``'package.module:function'``, imported at its first call: importing matplotlib takes half a second."""
     module, _, name = reference.partition(":")
     return lambda *arguments: getattr(importlib.import_module(module), name)(*arguments)
 

@@ -105,10 +105,7 @@ def pybullet() -> Any:
 
 
 class Simulator:
-    """pybullet's functions, bound to a separate simulator without a display.
-
-    pybullet's class for this purpose prints a line per simulator.
-    """
+    """pybullet's functions, bound to a separate simulator; pybullet's class for this prints a line per simulator."""
 
     def __init__(self) -> None:
         self._id = pybullet().connect(pybullet().DIRECT)

@@ -1,11 +1,10 @@
-"""Films as data: moving shapes in the plane, and wireframes, moving points and lines in space.
+"""Films as data: moving shapes in the plane, and wireframes, moving points and lines in space, in a hundredth of pictures' bytes.
 
-Web pages draw both at any size, in a hundredth of the bytes of pictures. Wireframes are seen from a fixed direction, from the front
-and slightly from the side and above, in parallel projection, so that lengths are comparable within and between films.
+Wireframes are seen from a fixed direction in parallel projection, so that lengths are comparable within and between films.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -20,10 +19,8 @@ Frames = list[NDArray[np.uint8]]
 
 SIDE, ABOVE = math.radians(28), math.radians(12)
 """View direction: rotation about the vertical towards +x, and elevation."""
-SIZE = 240
-"""Width and height of a frame in pixels."""
-FINER = 3
-"""Supersampling factor of frames, for antialiasing."""
+SIZE, FINER = 240, 3
+"""Width and height of a frame in pixels, and its supersampling factor."""
 PAPER, GROUND, GRID = (255, 255, 255), (238, 240, 242), (214, 218, 222)
 FLOOR, LIMB = "#dfe3e8", 0.045
 """Colour of the floor and width of lines in metres."""
@@ -112,28 +109,19 @@ def of_wireframe(wireframe: Wireframe) -> VectorFilm:
     at = seen(wireframe.points)[..., :2]
     left, lower, side = window([wireframe])
     shapes = [still("area", seen(disc(wireframe.room[0]))[:, :2], FLOOR)]
-    shapes += [
-        Shape("line", at[:, list(pair)], colour, LIMB) for pair, colour in zip(wireframe.lines, wireframe.colours, strict=True)
-    ]
+    lines = zip(wireframe.lines, wireframe.colours, strict=True)
+    shapes += [Shape("line", at[:, list(pair)], colour, LIMB) for pair, colour in lines]
     shapes += [Shape("dots", at[:, [point]], colour, radius) for point, radius, colour in wireframe.heads]
     return VectorFilm(shapes, (left, lower, side, side), wireframe.rate)
 
 
 def seen(points: Points) -> Points:
-    """Project points to the picture.
-
-    Args:
-        points: ``(..., 3)`` in metres.
-
-    Returns:
-        ``(..., 3)``: right, up, and towards the viewer, in metres.
-    """
+    """Project points ``(..., 3)`` to the picture ``(..., 3)``: right, up, and towards the viewer, in metres."""
     x, y, z = np.moveaxis(points, -1, 0)
     # The viewer is at +y, so +x points left.
     across, near = -x * math.cos(SIDE) + y * math.sin(SIDE), x * math.sin(SIDE) + y * math.cos(SIDE)
-    return np.stack(
-        (across, z * math.cos(ABOVE) - near * math.sin(ABOVE), near * math.cos(ABOVE) + z * math.sin(ABOVE)), axis=-1
-    ).astype(np.float32)
+    up, towards = z * math.cos(ABOVE) - near * math.sin(ABOVE), near * math.cos(ABOVE) + z * math.sin(ABOVE)
+    return np.stack((across, up, towards), axis=-1).astype(np.float32)
 
 
 def window(wireframes: Sequence[Wireframe]) -> tuple[float, float, float]:
@@ -155,14 +143,9 @@ def disc(radius: float) -> Points:
     return np.stack((radius * np.cos(angle), radius * np.sin(angle), 0 * angle), axis=-1).astype(np.float32)
 
 
-def drawn(wireframe: Wireframe, size: int = SIZE) -> list[NDArray[np.uint8]]:
-    """Draw frames ``(size, size, 3)`` of a motion on a round floor.
-
-    Args:
-        wireframe: the motion.
-        size: size of a frame in pixels.
-    """
-    wide = size * FINER
+def drawn(wireframe: Wireframe) -> Frames:
+    """Draw frames ``(SIZE, SIZE, 3)`` of a motion on a round floor."""
+    wide = SIZE * FINER
     left, lower, side = window([wireframe])
     margin = 0.04 * wide
     scale = (wide - 2 * margin) / side
@@ -174,7 +157,9 @@ def drawn(wireframe: Wireframe, size: int = SIZE) -> list[NDArray[np.uint8]]:
         return at
 
     empty = Image.new("RGB", (wide, wide), PAPER)
-    _floor(ImageDraw.Draw(empty), place, wireframe.room[0], wide)
+    for part, colour in ((1.0, GROUND), (2 / 3, None), (1 / 3, None)):  # rings, a third of the floor apart
+        edge = [(x, y) for x, y, _ in place(disc(wireframe.room[0] * part)).tolist()]
+        ImageDraw.Draw(empty).polygon(edge, fill=colour, outline=GRID, width=max(1, wide // 360))
     pictures = []
     at = place(wireframe.points)
     shade = place(wireframe.points * np.array([1, 1, 0], dtype=np.float32))
@@ -189,14 +174,8 @@ def drawn(wireframe: Wireframe, size: int = SIZE) -> list[NDArray[np.uint8]]:
             _line(pen, frame[a], frame[b], wireframe.colours[index], LIMB * scale)
         for point, radius, colour in wireframe.heads:
             _ball(pen, frame[point], radius * scale, colour)
-        pictures.append(np.asarray(picture.resize((size, size), Image.Resampling.BOX), dtype=np.uint8))
+        pictures.append(np.asarray(picture.resize((SIZE, SIZE), Image.Resampling.BOX), dtype=np.uint8))
     return pictures
-
-
-def _floor(pen: ImageDraw.ImageDraw, place: Callable[[Points], Points], radius: float, wide: int) -> None:
-    for part, colour in ((1.0, GROUND), (2 / 3, None), (1 / 3, None)):  # rings, a third of the floor apart
-        edge = [(x, y) for x, y, _ in place(disc(radius * part)).tolist()]
-        pen.polygon(edge, fill=colour, outline=GRID, width=max(1, wide // 360))
 
 
 def _line(pen: ImageDraw.ImageDraw, a: Points, b: Points, colour: str | tuple[int, int, int], width: float) -> None:

@@ -46,12 +46,7 @@ OWN = "own"
 
 @dataclass(frozen=True)
 class FileSource:
-    """Source that splits the demonstrations of a file.
-
-    Attributes:
-        demonstrations: all demonstrations.
-        held_out: mask of the validation split, ``(demo,)`` of bool.
-    """
+    """Source that splits the demonstrations of a file by the mask ``held_out (demo,)`` of the validation split."""
 
     demonstrations: Demonstrations
     held_out: Tensor
@@ -62,11 +57,7 @@ class FileSource:
         return self.demonstrations.rows(wanted.nonzero()[:, 0].tolist())
 
     def draw(self, task: str, count: int, seed: int, workers: int = 1) -> Demonstrations:
-        """The first ``count`` demonstrations of a concept.
-
-        Raises:
-            UserError: if there are fewer.
-        """
+        """The first ``count`` demonstrations of a concept; raises a ``UserError`` if there are fewer."""
         rows = _rows(self.demonstrations, task)
         require(len(rows) >= count, "task", f"{count} demonstrations of {task!r} in the file", len(rows))
         return self.demonstrations.rows(rows[:count])
@@ -80,11 +71,7 @@ class FileSource:
 
 
 def own_domain(
-    examples: Demonstrations,
-    training: Sequence[str],
-    horizon: int,
-    metrics: Mapping[str, float],
-    source: FileSource | None = None,
+    examples: Demonstrations, training: Sequence[str], horizon: int, metrics: Mapping[str, float], source: FileSource | None = None
 ) -> Domain:
     """Domain of user data.
 
@@ -92,11 +79,8 @@ def own_domain(
         examples: demonstrations that plans are compared with, at least one of each evaluated concept.
         training: training concepts.
         horizon: states in a plan.
-        metrics: names and numbers, see this module.
+        metrics: names and numbers, see this module; an unknown one raises a ``UserError``.
         source: source of demonstrations; ``None`` for the examples.
-
-    Raises:
-        UserError: for an unknown metric.
     """
     unknown = sorted(set(metrics) - set(METRICS))
     require(not unknown, "data.metrics", f"some of {', '.join(METRICS)}", ", ".join(unknown))
@@ -108,11 +92,7 @@ def own_domain(
         source=lambda root: source,
         observed=examples.features,
         metrics={name: METRICS[name](examples, horizon, number) for name, number in metrics.items()},
-        comparison=Comparison(
-            headline=next(iter(metrics), ""),
-            distance=partial(_distance, examples),
-            fresh=False,  # the file is all there is
-        ),
+        comparison=Comparison(headline=next(iter(metrics), ""), distance=partial(_distance, examples), fresh=False),
         recordings=Recordings(recorder=drawn_by_hand(examples, horizon)),
     )
 
@@ -144,11 +124,7 @@ def domain_from_file(path: str, horizon: int | None, metrics: Mapping[str, float
 
 
 def read_own(path: str) -> Demonstrations:
-    """Read user data; demonstrations without a text are named after the file.
-
-    Args:
-        path: ``.npz`` or safetensors, the folder of a LeRobot data set, or the name of an installed Minari data set such as
-            ``strokes/test-v0``.
+    """Read user data, see :meth:`Demonstrations.load`; demonstrations without a text are named after the file.
 
     Raises:
         UserError: naming the file, if it is missing or damaged.
@@ -211,14 +187,7 @@ def _recognised(examples: Demonstrations, horizon: int, number: float) -> Metric
 
 
 def _nearest(name: str, examples: Demonstrations, number: float, distances: Callable[[Tensor], Tensor]) -> Metric:
-    """Whether most of the nearest examples are of the goal.
-
-    Args:
-        name: name of the metric.
-        examples: demonstrations of all concepts.
-        number: number of nearest examples.
-        distances: ``states (n, horizon, state) -> (n, example)``.
-    """
+    """Whether most of the ``number`` nearest examples, by ``distances: states (n, ...) -> (n, example)``, are of the goal."""
     require(number >= 1, f"data.metrics.{name}", "1 or more neighbours", f"{number:g}")
     count = min(int(number), len(examples))
 

@@ -17,16 +17,14 @@ from ftl_lightning.services.text import figure_text
 if TYPE_CHECKING:  # importing matplotlib takes half a second
     from matplotlib.figure import Figure
 
-DPI = 100
-"""Pixels per inch of a domain's picture."""
+DPI = 100  # of a domain's picture
 POINTS, LEAST = 2.2, 9.0
-"""Font size in points per inch of a picture's width, legible on cards, and minimum font size."""
+"""Font size in points per inch of a picture's width, and minimum font size."""
 LETTER, LINE = 0.68, 1.8
 """Width of a bold letter and height of a line, relative to the font size."""
 MAX_COLUMNS = 8
 MAX_FRAMES = 60
-SECONDS = 3.0
-"""Duration of a film of a plan."""
+SECONDS = 3.0  # of a film of a plan
 PATH, START, PLAIN, RIGHT, WRONG = "#3f6fb5", "#e4704a", "#8a8a8a", "#2e9e46", "#d03a3a"
 COLOURS = ("#3f6fb5", "#e4704a", "#4c9f70", "#8a63b3", "#c9a227", "#5b5b5b")
 
@@ -59,14 +57,7 @@ class Show:
 
 @dataclass(frozen=True)
 class Drawn:
-    """Group of plans in a figure.
-
-    Attributes:
-        label: such as ``'demonstrations'``.
-        states: ``(plan, horizon, state)`` in the domain's units.
-        starts: initial states, or ``None``.
-        right: whether each plan is right ``(plan,)``; ``None`` if not judged.
-    """
+    """Group of plans ``(plan, horizon, state)`` in a figure, with initial states and verdicts ``(plan,)`` or ``None``."""
 
     label: str
     states: Tensor
@@ -75,14 +66,7 @@ class Drawn:
 
 
 def beside(show: Show, demonstrations: Drawn, samples: Drawn, title: str) -> "Figure":
-    """Draw demonstrations above samples, to check visually whether a concept was learned.
-
-    Args:
-        show: the domain's pictures.
-        demonstrations: drawn above.
-        samples: drawn below, of the same horizon.
-        title: title of the figure.
-    """
+    """Draw demonstrations above samples of the same horizon, to check visually whether a concept was learned."""
     if show.beside is not None:
         return show.beside(demonstrations.states, samples.states, title, samples.right)
     from matplotlib.figure import Figure
@@ -122,10 +106,7 @@ def _pixels(figure: "Figure") -> NDArray[np.uint8]:
 
 
 def line_drawings(columns: Sequence[str]) -> Show:
-    """Generic pictures of states with these columns: paths in two or three dimensions, otherwise lines over time.
-
-    Paths are also filmed.
-    """
+    """Generic pictures of states: paths in two or three dimensions, which are also filmed, otherwise lines over time."""
 
     def picture(states: Tensor, right: Sequence[bool] | None, title: str, starts: InitialStates | None) -> "Figure":
         return _grid(columns, [Drawn("", states, right=right)], title)
@@ -138,7 +119,7 @@ def line_drawings(columns: Sequence[str]) -> Show:
 
 
 def framed(count: int, right: Sequence[bool] | None, title: str, columns: int, size: tuple[float, float]) -> "Figure":
-    """Grid of empty panels with equal axes: green frames for right plans, red for wrong ones, grey for plans that are not judged.
+    """Grid of empty panels with equal axes, framed green for right plans, red for wrong ones, grey for plans that are not judged.
 
     Args:
         count: number of panels.
@@ -164,13 +145,7 @@ def framed(count: int, right: Sequence[bool] | None, title: str, columns: int, s
 
 
 def _grid(names: Sequence[str], groups: Sequence[Drawn], title: str) -> "Figure":
-    """Draw groups of plans on a shared scale, each from a new row.
-
-    Args:
-        names: names of columns.
-        groups: groups of plans.
-        title: title of the figure.
-    """
+    """Draw groups of plans on a shared scale, each from a new row."""
     from matplotlib.figure import Figure
 
     states = torch.cat([group.states for group in groups])

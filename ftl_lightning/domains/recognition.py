@@ -1,16 +1,14 @@
 """Recognition by examples: whether a plan belongs to a concept and is as typical of it as real behaviour.
 
 Features of a plan, after columns are scaled alike: place (mean over time of each column), size (root mean square about the place),
-shape (the normalised rest, as coefficients of the discrete cosine transform over time) and roughness (mean squared second
-difference over time). A single state has only a size and a shape, its columns.
+shape (the normalised rest, as coefficients of the discrete cosine transform) and roughness (mean squared second difference). A
+single state has only a size and a shape, its columns.
 
 A concept is a Gaussian over place, size and shape (regularised discriminant analysis; Friedman, 1989). Its variances are pooled
-over concepts and move towards the concept's variances as its examples increase. Directions in which its examples vary, such as
-pace, enter its covariance. A plan belongs to the likeliest concept.
-
-The largest distance of real behaviour from its concept is estimated by leave-one-out, with as many examples as the concept has:
-few examples cover less of a concept. Only excess roughness counts. If no concept has two examples, only the likeliest concept and
-the roughness decide.
+over concepts and move towards the concept's variances as its examples increase; directions in which its examples vary enter its
+covariance. A plan belongs to the likeliest concept. The largest distance of real behaviour from its concept is estimated by
+leave-one-out, with as many examples as the concept has. Only excess roughness counts. If no concept has two examples, only the
+likeliest concept and the roughness decide.
 """
 
 import math
@@ -29,22 +27,16 @@ STILL = 0.05
 """Size, relative to the examples', below which behaviour counts as still and has no shape."""
 VARIANCE = 4e-4
 """Minimum variance of a place or size, in squared spreads of a column: a standard deviation of 1/50."""
-EVEN = 0.1
-"""Minimum variance of a shape coefficient, relative to the mean variance."""
-SHAPE_VARIANCE = 1e-4
-"""Minimum variance of a whole shape, whose root mean square is 1."""
+EVEN, SHAPE_VARIANCE = 0.1, 1e-4
+"""Minimum variance of a shape coefficient, relative to the mean variance, and of a whole shape, whose root mean square is 1."""
 ROUGHNESS = 4e-4
 """Mean squared second difference that counts as smooth, in squared spreads of a column."""
-PRIOR = 10.0
-"""Weight, in examples, of the pooled variances of places and sizes."""
-SHAPE_PRIOR = 5.0
-"""Weight, in examples, of the pooled variances of shapes."""
+PRIOR, SHAPE_PRIOR = 10.0, 5.0
+"""Weight, in examples, of the pooled variances of places and sizes, and of shapes."""
 RESTING = 0.25
 """Deviation from the last state after the end that counts as rest, in spreads of a column."""
-ENDS = 8
-"""Maximum number of candidate lengths of a plan."""
-LEFT_OUT = 200
-"""Maximum number of examples for leave-one-out."""
+ENDS, LEFT_OUT = 8, 200
+"""Maximum number of candidate lengths of a plan, and of examples for leave-one-out."""
 FEW = 1.0
 """Relative increase of limits, divided by the number of concepts in leave-one-out: few concepts give uncertain limits."""
 ROUGHER = 2.0
@@ -53,14 +45,7 @@ ROUGHER = 2.0
 
 @dataclass(frozen=True)
 class _Features:
-    """Features of behaviour.
-
-    Attributes:
-        position: ``(n, columns + 1)``, place in spreads of the columns and logarithm of the size; for single states only the size.
-        shape: ``(n, coefficient)``.
-        roughness: ``(n, columns)``.
-        rest: ``(n,)``, root mean square deviation from the last state after the end, in spreads of the columns.
-    """
+    """Place ``(n, columns + 1)`` with the size's logarithm, shape, roughness, and deviation from rest after the end ``(n,)``."""
 
     position: Tensor
     shape: Tensor
@@ -96,14 +81,8 @@ class _Within:
 class _Concept:
     """Gaussian model of a concept.
 
-    Attributes:
-        position, variance: mean and predictive variance of positions.
-        shape: mean of shapes.
-        precision: diagonal part of the shapes' precision ``(coefficient,)``.
-        loadings, inverse: low-rank part ``(k, coefficient)`` and ``(k, k)``, directions of variation (Woodbury's identity).
-        volume: log-determinant of both covariances, for known means: otherwise concepts with many examples would be favoured, as
-            coefficients of a shape are correlated.
-        roughness: ``(columns,)``.
+    Precision of shapes is ``precision``, its diagonal, and a low-rank part ``loadings``, ``inverse`` (Woodbury's identity).
+    ``volume`` is the log-determinant for known means: otherwise concepts with many examples would be favoured.
     """
 
     position: Tensor
@@ -136,11 +115,7 @@ class _Concept:
         return cls(mean[0], variance * wider, mean[1], 1 / (diagonal * wider), scaled, inverse, float(volume), mean[2])
 
     def distances(self, features: _Features, resting: float) -> tuple[Tensor, Tensor]:
-        """Distances of behaviour from the concept.
-
-        Args:
-            features: features of ``n`` plans.
-            resting: deviation that counts as rest, in spreads of the columns.
+        """Distances of ``n`` plans from the concept.
 
         Returns:
             -2 log-likelihood ``(n,)`` up to a constant, and deviations ``(n, 5)`` in place, size, shape, roughness and rest, each
@@ -195,14 +170,8 @@ class Recognition:
         self._limits = cache(self._left_out)
 
     def recognised(self, goal: str, states: Tensor) -> Tensor:
-        """Whether a concept is the likeliest for plans and they are typical of it.
-
-        Args:
-            goal: a concept with examples.
-            states: ``(sample, time, state)``; plans that are not finite are not recognised.
-
-        Returns:
-            ``(sample,)`` of bool.
+        """Whether a goal is the likeliest concept of finite plans ``(sample, time, state)`` and they are typical of it
+        ``(sample,)``.
         """
         finite = states.isfinite().flatten(1).all(dim=1)
         ending = self._ending(self._fitted(torch.where(finite[:, None, None], states, 0)))

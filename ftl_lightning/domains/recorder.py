@@ -17,30 +17,20 @@ from ftl_lightning.services.errors import require, shown
 Kind = Literal["draw", "arrange", "steer"]
 Numbers = NDArray[np.float64]
 
-MOST_STEPS = 20_000
-"""Maximum number of steps in a path: more than five minutes at 60 per second."""
+MOST_STEPS, FINEST = 20_000, 20_000
+"""Maximum number of steps in a path, more than five minutes, and of points of a line during smoothing."""
 AROUND = 4.0
 """Maximum distance of a path from the window, in widths and heights of the window."""
-FINEST = 20_000
-"""Maximum number of points of a line during smoothing."""
 MARGIN = 0.15
 """Margin of the window around the examples, relative to their extent."""
-SHORTEST = 0.02
-"""Minimum length of a line, relative to the window's width."""
-PIXEL = 1 / 400
-"""Approximate size of a screen pixel relative to the window's width; scale of smoothing."""
+SHORTEST, PIXEL = 0.02, 1 / 400
+"""Minimum length of a line, and scale of smoothing (a screen pixel), relative to the window's width."""
 FRAME = "#dfe3e8"
 
 
 @dataclass(frozen=True)
 class Piece:
-    """Movable object of a scene.
-
-    Attributes:
-        name: such as ``'circle'``; read aloud by screen readers.
-        at: initial position, x and y in the film's unit.
-        shapes: indices of the film's shapes that move with the piece.
-    """
+    """Movable object of a scene: name, initial position in the film's unit, and indices of the film's shapes that move with it."""
 
     name: str
     at: tuple[float, float]
@@ -90,15 +80,7 @@ class Recorder:
 
 
 def check_path(scene: Scene, path: Any, seconds: Any) -> tuple[Numbers, Numbers]:
-    """Validate a recorded path.
-
-    Args:
-        scene: scene shown to the user.
-        path: numbers ``(step, piece, 2)`` in the film's unit, as nested lists or an array; a drawn line has a single piece.
-        seconds: time of each step ``(step,)``.
-
-    Returns:
-        Path and times as arrays.
+    """Validate a recorded path ``(step, piece, 2)`` in the film's unit and times ``(step,)``, and return them as arrays.
 
     Raises:
         UserError: for anything else, numbers that are not finite, too many steps, places far outside the window, or times that
@@ -142,12 +124,7 @@ def at_even_steps(line: Numbers, count: int) -> Numbers:
 
 
 def smoothed(line: Numbers, blur: float) -> Numbers:
-    """Smooth a line along its length; its ends stay.
-
-    Args:
-        line: ``(point, 2)``.
-        blur: standard deviation of the Gaussian weights along the line, in its unit.
-    """
+    """Smooth a line ``(point, 2)`` by Gaussian weights of standard deviation ``blur`` along its length; its ends stay."""
     count = min(int(np.ceil(2 * reached(line)[-1] / blur)) + 2, FINEST)  # two points per blur
     even = at_even_steps(line, count)
     reach = min(6, count - 1)  # three times the blur
@@ -159,12 +136,7 @@ def smoothed(line: Numbers, blur: float) -> Numbers:
 
 
 def drawn_by_hand(examples: Demonstrations, horizon: int) -> Recorder | None:
-    """Recorder of drawn lines; ``None`` if behaviour is not a line in a plane.
-
-    Args:
-        examples: demonstrations, which determine the window.
-        horizon: states of a plan and of a drawn line.
-    """
+    """Recorder of lines of ``horizon`` states in a window around examples; ``None`` if behaviour is not a line in a plane."""
     if examples.states.shape[2] != 2 or horizon < 2 or examples.observed:
         return None
     covered = torch.cat([states[:length] for states, length in zip(examples.states, examples.lengths.tolist(), strict=True)])
@@ -191,6 +163,5 @@ def drawn_by_hand(examples: Demonstrations, horizon: int) -> Recorder | None:
             provenance={"generator": "by hand"},
         )
 
-    return Recorder(
-        "draw", "Draw one line of the kind that you mean; how fast you draw does not matter.", lambda task, seed: empty, record
-    )
+    hint = "Draw one line of the kind that you mean; how fast you draw does not matter."
+    return Recorder("draw", hint, lambda task, seed: empty, record)

@@ -23,9 +23,7 @@ def _offered() -> dict[str, str]:
 
 @functools.cache
 def load_domain(name: str) -> Domain:
-    """Load a domain by entry-point name or ``package.module:DOMAIN``.
-
-    The module is imported. For names read from files, use :func:`domain_of_file`.
+    """Import a domain by entry-point name or ``package.module:DOMAIN``; for names in files see :func:`domain_of_file`.
 
     Raises:
         UserError: if there is no such domain, or the object is not a domain.
@@ -59,11 +57,7 @@ def is_known(name: str) -> bool:
 
 
 def domain_of_file(name: str) -> Domain:
-    """Load a domain named in a file, if it is in an installed package or trusted by the user.
-
-    Raises:
-        UserError: for any other domain; nothing is imported.
-    """
+    """Load a domain named in a file; one that is neither in an installed package nor trusted raises a ``UserError``, unimported."""
     if is_known(name):
         return load_domain(name)
     module, colon, _ = name.partition(":")
@@ -76,12 +70,7 @@ def domain_of_file(name: str) -> Domain:
 
 
 def recorded_name(name: str) -> str:
-    """Name of a domain in files: its entry-point name if it has one, else the given name.
-
-    Models find their domain by this name; both ways of naming a domain give the same name.
-
-    Args:
-        name: see :func:`load_domain`.
+    """Name of a domain in files, by which models find it: its entry-point name if it has one, else the given name.
 
     Raises:
         UserError: see :func:`load_domain`.

@@ -80,8 +80,5 @@ def training_suite(concepts: tuple[str, ...]) -> Suite:
 
 
 def few_shot_suites(training: tuple[str, ...], new: tuple[str, ...]) -> dict[str, Suite]:
-    """The suites ``'training'`` and ``'new'``: training concepts, and concepts learned from a few demonstrations each.
-
-    The goal of a task is the text of its concept.
-    """
+    """The suites ``'training'`` and ``'new'``, of concepts learned from a few demonstrations each; goals are their texts."""
     return {"training": training_suite(training), "new": Suite(tuple(EvaluationTask("new concept", text, (text,)) for text in new))}

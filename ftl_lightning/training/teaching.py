@@ -36,9 +36,9 @@ class Teaching:
     def check_taught(self, domain: Domain, images: ImageEncoders | None) -> None:
         """Refuse names that the domain does not provide or the encoder of ``images`` cannot predict."""
         for name in self.weights:
-            known = domain.privileged.get(name)
+            known = domain.recordings.privileged.get(name)
             if known is None or images is None:
-                names = ", ".join(domain.privileged) if images is not None else "none, as no image is observed"
+                names = ", ".join(domain.recordings.privileged) if images is not None else "none, as no image is observed"
                 raise UserError(f"model.privileged: expected {names or 'none'} (domain {domain.name}), found {short(name)!r}")
             place, expected = f"model.privileged.{name}", f"image_encoder of {known.feature.shape[0]} points"
             require(images.size == known.feature.size, place, expected, f"one that reads {images.size} numbers")
@@ -55,7 +55,7 @@ class Teaching:
 
     def errors(self, domain: Domain, observed: Observed) -> dict[str, Tensor]:
         """Mean errors of the last image encodings by name."""
-        return {name: domain.privileged[name].error(self._read, observed[name]).mean() for name in self.weights}
+        return {name: domain.recordings.privileged[name].error(self._read, observed[name]).mean() for name in self.weights}
 
     def apart(self, domain: Domain, batch: Batch) -> tuple[Batch, Batch | None]:
         """Split a batch into windows with encoded images, at least one, and windows without images."""
@@ -70,6 +70,6 @@ class Teaching:
     def told(self, domain: Domain, observed: Observed, draw: torch.Generator) -> dict[str, Tensor]:
         """Add simulated image encodings to the observations of windows without images."""
         (name,) = self.weights
-        tell = domain.privileged[name].told
+        tell = domain.recordings.privileged[name].told
         assert tell is not None
         return {**observed, READ: tell(observed[name], draw)}

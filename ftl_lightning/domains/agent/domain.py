@@ -8,21 +8,8 @@ from torch import Tensor
 
 from ftl_lightning.data.distances import path_distance
 from ftl_lightning.data.features import InitialStates, Observed, check_starts
+from ftl_lightning.domains.agent import scenes
 from ftl_lightning.domains.agent.expert import NAME, SPEED, STATE_NAMES, STATE_UNITS, Expert, demonstrate, environment
-from ftl_lightning.domains.agent.scenes import (
-    FEATURE,
-    LOOKAHEAD,
-    MAX_STEPS,
-    OBSERVED,
-    PLANE,
-    REACH,
-    STATE,
-    STEP,
-    check_simulator,
-    object_positions,
-    parse,
-    target,
-)
 from ftl_lightning.domains.agent.tasks import PUBLISHED, SUITES, TRAINING_CONCEPTS
 from ftl_lightning.domains.comparison import Comparison, Paper
 from ftl_lightning.domains.domain import ACCURACY, Concepts, Domain, Metric, Plans, Recordings, View, deferred
@@ -38,159 +25,116 @@ RENDERING, STEERING = "ftl_lightning.domains.agent.rendering", "ftl_lightning.do
 def reads(task: str) -> bool:
     """Whether a text is a goal."""
     try:
-        return bool(parse(task))
+        return bool(scenes.parse(task))
     except UserError:
         return False
 
 
 def _to_each(goal: str, positions: Tensor, world: Tensor) -> tuple[Tensor, Tensor]:
-    """Distances in metres ``(scene, time)`` to the target and to the distractor.
-
-    Args:
-        goal: the task in words.
-        positions: agent's positions ``(scene, time, 3)``.
-        world: ``(scene, 52)``.
-    """
-    both = torch.linalg.vector_norm(positions[:, :, None] - object_positions(world)[:, None], dim=-1)
-    chosen = target(goal, world)[:, None, None].expand(-1, both.shape[1], 1)
+    """Distances in metres ``(scene, time)`` of positions ``(scene, time, 3)`` to the target and to the distractor."""
+    both = torch.linalg.vector_norm(positions[:, :, None] - scenes.object_positions(world)[:, None], dim=-1)
+    chosen = scenes.target(goal, world)[:, None, None].expand(-1, both.shape[1], 1)
     return both.gather(-1, chosen)[..., 0], both.gather(-1, 1 - chosen)[..., 0]
 
 
 def progressed(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
-    """Whether a plan ends nearer to the target than it starts (paper, open loop).
-
-    Args:
-        goal: the task in words.
-        states: plans ``(scene, horizon, 13)``.
-        starts: initial states with ``world (scene, 52)``.
-
-    Returns:
-        ``(scene,)`` of bool; false where a plan is not finite.
-    """
-    world = check_starts(starts).observed[OBSERVED]
+    """Whether a plan ``(scene, horizon, 13)`` ends nearer to the target than it starts ``(scene,)`` (paper, open loop)."""
+    world = check_starts(starts).observed[scenes.OBSERVED]
     to_target, _ = _to_each(goal, torch.cat((world[:, None, :3], states[:, -1:, :3]), dim=1), world)
     return to_target[:, -1] < to_target[:, 0]
 
 
 def reached(goal: str, rollout: Rollout) -> dict[str, Tensor]:
-    """Outcomes of episodes (paper, closed loop).
+    """Outcomes of episodes ``(episode,)`` of bool (paper, closed loop).
 
-    Args:
-        goal: the task in words.
-        rollout: episodes with ``world (episode, time, 52)``, padded with the last.
-
-    Returns:
-        ``(episode,)`` of bool each: ``success``, the agent ends within :data:`REACH` of the target and never was within
-        :data:`REACH` of the distractor; ``distractor``, it was; ``progress``, it ends nearer to the target.
+    ``success``: the agent ends within :data:`~ftl_lightning.domains.agent.scenes.REACH` of the target and never was as near to the
+    distractor; ``distractor``: it was; ``progress``: it ends nearer to the target.
     """
-    world = rollout.observed[OBSERVED]
+    world = rollout.observed[scenes.OBSERVED]
     to_target, to_distractor = _to_each(goal, world[..., :3], world[:, 0])
-    touched = (to_distractor < REACH).any(dim=1)
-    return {
-        "success": (to_target[:, -1] < REACH) & ~touched,
-        "distractor": touched,
-        "progress": to_target[:, -1] < to_target[:, 0],
-    }
+    end, touched = to_target[:, -1], (to_distractor < scenes.REACH).any(dim=1)
+    return {"success": (end < scenes.REACH) & ~touched, "distractor": touched, "progress": end < to_target[:, 0]}
 
 
 def _encode_steps(states: Tensor, observed: Observed) -> Tensor:
     """Difference of each state ``(sample, horizon, 13)`` from the preceding state; the first from the present."""
-    return torch.diff(states, dim=1, prepend=observed[OBSERVED][:, None, :STATE])
+    return torch.diff(states, dim=1, prepend=observed[scenes.OBSERVED][:, None, : scenes.STATE])
 
 
 def _decode_steps(steps: Tensor, observed: Observed) -> Tensor:
     """Inverse of :func:`_encode_steps`."""
     # Not cumsum, which has no deterministic form on GPUs.
-    return torch.stack(list(itertools.accumulate(steps.unbind(dim=1), initial=observed[OBSERVED][:, :STATE]))[1:], dim=1)
+    present = observed[scenes.OBSERVED][:, : scenes.STATE]
+    return torch.stack(list(itertools.accumulate(steps.unbind(dim=1), initial=present))[1:], dim=1)
 
 
 def act(plans: Tensor, step: int, observed: Observed) -> Tensor:
-    """Forces ``(episode, 2)``: displacement to the plan's state :data:`LOOKAHEAD` steps ahead (paper, closed loop).
-
-    Args:
-        plans: ``(episode, horizon, 13)``.
-        step: steps since the plan was made.
-        observed: ``world (episode, 52)``.
-    """
-    ahead = plans[:, min(step + LOOKAHEAD, plans.shape[1] - 1)]
-    return (ahead - observed[OBSERVED][:, :STATE])[:, list(PLANE)]
+    """Forces ``(episode, 2)``: displacement to the plan's state ``LOOKAHEAD`` steps ahead (paper, closed loop)."""
+    ahead = plans[:, min(step + scenes.LOOKAHEAD, plans.shape[1] - 1)]
+    return (ahead - observed[scenes.OBSERVED][:, : scenes.STATE])[:, list(scenes.PLANE)]
 
 
 def _straight(world: Tensor, chosen: Tensor) -> Tensor:
     """Plans ``(scene, horizon, 13)`` straight to the chosen object, at the expert's speed."""
-    objects = object_positions(world)
-    goal = objects[torch.arange(len(objects)), chosen]
-    start = world[:, None, :3]
+    goal = scenes.object_positions(world)[torch.arange(len(world)), chosen]
     way = (goal - world[:, :3])[:, None]
     length = torch.linalg.vector_norm(way, dim=-1, keepdim=True)
-    driven = torch.minimum(torch.arange(HORIZON)[None, :, None] * STEP * SPEED, length)
-    plans = world[:, None, :STATE].repeat(1, HORIZON, 1)
-    plans[..., :3] = start + way * driven / length
+    driven = torch.minimum(torch.arange(HORIZON)[None, :, None] * scenes.STEP * SPEED, length)
+    plans = world[:, None, : scenes.STATE].repeat(1, HORIZON, 1)
+    plans[..., :3] = world[:, None, :3] + way * driven / length
     return plans
 
 
 def _nearest(goal: str, count: int, starts: InitialStates | None, seed: int) -> Tensor:
-    world = check_starts(starts).observed[OBSERVED]
-    away = torch.linalg.vector_norm(object_positions(world) - world[:, None, :3], dim=-1)
+    world = check_starts(starts).observed[scenes.OBSERVED]
+    away = torch.linalg.vector_norm(scenes.object_positions(world) - world[:, None, :3], dim=-1)
     return _straight(world, away.argmin(dim=1))
 
 
 def _random(goal: str, count: int, starts: InitialStates | None, seed: int) -> Tensor:
-    world = check_starts(starts).observed[OBSERVED]
-    draw = torch.Generator().manual_seed(seed)
-    return _straight(world, torch.randint(2, (len(world),), generator=draw))
+    world = check_starts(starts).observed[scenes.OBSERVED]
+    return _straight(world, torch.randint(2, (len(world),), generator=torch.Generator().manual_seed(seed)))
 
 
 def _oracle(goal: str, count: int, starts: InitialStates | None, seed: int) -> Tensor:
-    env, world = environment(), check_starts(starts).observed[OBSERVED]
-    drives = [
-        torch.from_numpy(demonstrate(env, state, chosen))
-        for state, chosen in zip(world.numpy(), target(goal, world).tolist(), strict=True)
-    ]
+    env, world = environment(), check_starts(starts).observed[scenes.OBSERVED]
+    targets = scenes.target(goal, world).tolist()
+    drives = [torch.from_numpy(demonstrate(env, *pair)) for pair in zip(world.numpy(), targets, strict=True)]
     env.close()
     rows = torch.arange(HORIZON)
-    return torch.stack([drive[rows.clamp(max=len(drive) - 1), :STATE] for drive in drives])
-
-
-def _from_start(states: Tensor) -> Tensor:
-    """Paths ``(plan, horizon, 2)`` in the plane, relative to their start."""
-    paths = states[..., list(PLANE)]
-    return paths - paths[:, :1]
+    return torch.stack([drive[rows.clamp(max=len(drive) - 1), : scenes.STATE] for drive in drives])
 
 
 def distance(states: Tensor, others: Tensor) -> Tensor:
-    """Root mean square distance ``(a, b)`` in metres between the agent's paths in the plane, relative to their starts.
-
-    The start is given, not generated. The end depends on the scene: correct plans in new scenes are novel.
-    """
-    return path_distance(_from_start(states), _from_start(others))
+    """Root mean square distance ``(a, b)`` in metres between the agent's paths in the plane, relative to their starts."""
+    paths, other_paths = states[..., list(scenes.PLANE)], others[..., list(scenes.PLANE)]
+    return path_distance(paths - paths[:, :1], other_paths - other_paths[:, :1])
 
 
 DOMAIN = Domain(
     name=NAME,
     plans=Plans(HORIZON, STATE_NAMES, STATE_UNITS, start_exponent=3.0, resolution=1e-3),
     concepts=Concepts(
-        training=TRAINING_CONCEPTS,
-        suites=SUITES,
-        reads=reads,
-        table=Path(__file__).parent / "embeddings.safetensors",
+        training=TRAINING_CONCEPTS, suites=SUITES, reads=reads, table=Path(__file__).parent / "embeddings.safetensors"
     ),
     source=lambda root: Expert(),
-    observed={OBSERVED: FEATURE},
+    observed={scenes.OBSERVED: scenes.FEATURE},
     metrics={ACCURACY: Metric(progressed)},
     show=Show(deferred(f"{RENDERING}:render"), vector_film=deferred(f"{RENDERING}:plan_film")),
     views={
         # Autoregressive methods need not copy the state, which changes by about 1% per step.
-        "steps": View({OBSERVED: FEATURE}, observe=lambda observed: observed, encode=_encode_steps, decode=_decode_steps)
+        "steps": View(
+            {scenes.OBSERVED: scenes.FEATURE}, observe=lambda observed: observed, encode=_encode_steps, decode=_decode_steps
+        )
     },
     closed_loop=ClosedLoop(
         environment=environment,
         act=act,
-        steps=MAX_STEPS,
+        steps=scenes.MAX_STEPS,
         judge=reached,
         film=deferred(f"{RENDERING}:film"),
         vector_film=deferred(f"{RENDERING}:vector_film"),
-        expect=check_simulator,
+        expect=scenes.check_simulator,
     ),
     comparison=Comparison(
         headline="closed loop success",

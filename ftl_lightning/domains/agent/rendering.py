@@ -14,30 +14,22 @@ from ftl_lightning.domains.execution import Rollout
 from ftl_lightning.domains.films import Shape, VectorFilm, regular, some, still
 from ftl_lightning.domains.pictures import framed
 
-MARKERS = {"cone": "^", "sphere": "o", "bowl": "v", "cube": "s"}
-"""Markers; a bowl is an open triangle pointing down."""
+MARKERS = {"cone": "^", "sphere": "o", "bowl": "v", "cube": "s"}  # a bowl is an open triangle pointing down
 CORNERS = {"cone": (3, np.pi / 2), "cube": (4, np.pi / 4)}
 """Number of corners and angle of the first corner."""
 SEEN = (-2.1, 2.1), (-4.8, -2.8)
 """Ranges of x and z in pictures."""
 MAX_COLUMNS = 4
-FRAMES = 40
-"""Maximum number of frames of an episode."""
-SIZE = 0.1
-"""Half the width of a body in metres."""
+FRAMES = 40  # at most, of an episode
+SIZE = 0.1  # half the width of a body in metres
 AGENT = "#c79a2b"
 STEPS_A_SECOND = 30.0
 """Simulation steps per second of a vector film: 1.5 times real time."""
 
 
 def render(states: Tensor, right: Sequence[bool] | None, title: str, starts: InitialStates | None) -> Figure:
-    """Draw a grid of top-view scenes with the agent's path.
-
-    Args:
-        states: plans ``(scene, horizon, 13)``.
-        right: whether the task holds in each scene (green and red frames); ``None`` for grey frames.
-        title: title above the grid.
-        starts: initial states with ``world (scene, 52)``.
+    """Draw a grid of top-view scenes ``(scene, horizon, 13)`` with the agent's path; frames are green where the task holds, else
+    red.
     """
     figure = framed(len(states), right, title, MAX_COLUMNS, (2.6, 1.3))
     for axes, plan, initial in zip(figure.axes, states, check_starts(starts).observed[OBSERVED], strict=False):
@@ -60,15 +52,13 @@ def _end(observations: Tensor) -> int:
 
 
 def film(rollout: Rollout, plans: Tensor) -> list[NDArray[np.uint8]]:
-    """Film an episode: at most :data:`FRAMES` frames ``(height, width, 3)``, until nothing moves any more.
-
-    Plans are not drawn: the simulator renders the frames.
+    """Film an episode: at most :data:`FRAMES` frames ``(height, width, 3)`` of the simulator, without plans, until nothing
+    moves.
     """
     observations = rollout.observed[OBSERVED][0]
-    times = some(_end(observations), FRAMES)
     env = environment()
     pictures = []
-    for time in times:
+    for time in some(_end(observations), FRAMES):
         env.reset(options={"scene": observations[time].numpy()})
         pictures.append(env.render())
     env.close()
@@ -87,12 +77,7 @@ def plan_film(states: Tensor, starts: InitialStates | None) -> VectorFilm:
 
 
 def from_above(world: Tensor, states: Tensor) -> VectorFilm:
-    """Top-view film of a scene and the agent's path; the agent is the last shape.
-
-    Args:
-        world: ``(52,)``.
-        states: ``(time, 3 or more)``; the first three columns are the agent's position.
-    """
+    """Top-view film of a scene ``(52,)`` and the agent's path ``(time, 3 or more)``; the agent is the last shape."""
     end = _end(states)
     times = some(end, FRAMES)
     agent = states[times][:, list(PLANE)].numpy()[:, None]

@@ -23,8 +23,7 @@ COLOURS = {"red": (255, 87, 34), "yellow": (217, 191, 119), "purple": (149, 56, 
 SHAPES = ("cone", "sphere", "bowl", "cube")
 TYPES = ("agent", "object 1", "object 2")
 
-HEIGHT = 0.102
-"""Height of centres above the ground, half the height of bodies."""
+HEIGHT = 0.102  # of centres above the ground
 AGENT_START = (0.0, HEIGHT, -3.806)
 OBJECT_X, OBJECT_Z = (0.0, 1.66), (-4.355, -3.257)
 """Range of object 1; the range of object 2 is its mirror image in x."""
@@ -42,10 +41,8 @@ _OBJECT = 3 + _TAIL
 INITIAL = STATE + _TAIL + 2 * _OBJECT
 """Columns of an initial state, 52: the agent's state, type, rgba and shape; each object's position, type, rgba and shape."""
 OBJECT_COLUMNS = tuple(slice(start, start + _OBJECT) for start in range(STATE + _TAIL, INITIAL, _OBJECT))
-PLANE = (0, 2)
-"""Columns x and z of a position."""
-OBSERVED = "world"
-"""Name of the observed feature: the agent and both objects."""
+PLANE = (0, 2)  # columns x and z of a position
+OBSERVED = "world"  # the observed feature: the agent and both objects
 FEATURE = Feature(
     shape=(INITIAL,),
     # Position, colour and shape (as attributes) of each object; the type would break their symmetry.
@@ -57,19 +54,17 @@ FEATURE = Feature(
     state=tuple(range(STATE)),
 )
 
-STEP = 0.05
-"""Seconds between states."""
+STEP = 0.05  # seconds between states
 SUBSTEPS = 6
 MAX_STEPS = 128
 LOOKAHEAD = 5
-"""An action is the displacement to the plan's state this many steps ahead (paper: a_t = tau_{t+5} - s_t)."""
+"""An action is the displacement to the plan's state so many steps ahead (paper: a_t = tau_{t+5} - s_t)."""
 DRAG = 16.0
 """Decay rate of the agent's speed per second, high enough to avoid overshooting."""
 MASS = LOOKAHEAD * STEP / DRAG
-"""Mass in kg. A plan at constant speed v is LOOKAHEAD * STEP * v ahead, and drag is MASS * DRAG * v: with this mass, the
-displacement in metres, applied as a force in newtons, keeps the agent at the plan's speed."""
-MAX_FORCE = 0.2
-"""Maximum force in newtons; larger forces are scaled down."""
+"""Mass in kg with which the displacement in metres, applied as a force in newtons, keeps the agent at the plan's speed: a plan at
+speed v is LOOKAHEAD * STEP * v ahead, and drag is MASS * DRAG * v."""
+MAX_FORCE = 0.2  # newtons; larger forces are scaled down
 RADIUS = {"cone": 0.11, "sphere": HEIGHT, "bowl": 0.13, "cube": HEIGHT}
 """Radius of the bodies' footprints in metres; half the edge of a cube."""
 MARGIN = 0.001
@@ -82,18 +77,12 @@ TRAINING_GROUPS = (
 """Colour and shape of pretraining objects; both objects of a training scene belong to the same group (paper)."""
 _TRAINING_LOOKS = tuple(itertools.chain(*TRAINING_GROUPS))
 
-Look = tuple[str, str]
-"""Colour and shape."""
+Look = tuple[str, str]  # colour and shape
 
 
 @dataclass(frozen=True)
 class Goal:
-    """Look of the target; ``None`` for any.
-
-    Attributes:
-        colour: a key of :data:`COLOURS`.
-        shape: one of :data:`SHAPES`.
-    """
+    """Look of the target: a key of :data:`COLOURS` and one of :data:`SHAPES`; ``None`` for any."""
 
     colour: str | None
     shape: str | None
@@ -107,11 +96,7 @@ _GRAMMAR = re.compile(rf"go to (?:({'|'.join(COLOURS)}) )?(object|{'|'.join(SHAP
 
 
 def parse(task: str) -> Goal:
-    """Read 'go to red object', 'go to bowl' or 'go to red bowl'.
-
-    Raises:
-        UserError: for anything else.
-    """
+    """Read 'go to red object', 'go to bowl' or 'go to red bowl'; raises a ``UserError`` for anything else."""
     match = _GRAMMAR.fullmatch(task)
     if not match or match.groups() == (None, "object"):
         raise UserError(
@@ -125,8 +110,8 @@ def parse(task: str) -> Goal:
 def pairs(goal: Goal) -> list[tuple[Look, Look]]:
     """Looks of target and distractor for a goal (paper, appendix on data).
 
-    For goals of a single attribute, both objects are from the same group of pretraining. For goals of two attributes, distractors
-    are from pretraining and share an attribute of the target.
+    For goals of one attribute, both are from the same group of pretraining; for goals of two, distractors are from pretraining and
+    share an attribute of the target.
     """
     if goal.colour and goal.shape:
         target = (goal.colour, goal.shape)
@@ -140,16 +125,7 @@ def pairs(goal: Goal) -> list[tuple[Look, Look]]:
 
 
 def scenes(task: str, count: int, seed: int) -> Tensor:
-    """Draw initial states of a task, with pairs of looks and sides of the target balanced.
-
-    Args:
-        task: see :func:`parse`.
-        count: number of scenes.
-        seed: seed; the same task and seed give the same bytes.
-
-    Returns:
-        ``(count, 52)`` float32.
-    """
+    """Draw initial states ``(count, 52)`` of a task, with pairs of looks and sides of the target balanced; deterministic."""
     goal = parse(task)
     # Two streams: fewer scenes are a prefix of more.
     order, place = (np.random.default_rng([seed, task_key(task), stream]) for stream in range(2))
@@ -172,12 +148,7 @@ def _positions(rng: np.random.Generator) -> list[tuple[float, float]]:
 
 
 def initial_state(looks: Sequence[Look], positions: Sequence[tuple[float, float]]) -> NDArray[np.float32]:
-    """Initial state ``(52,)`` with a resting agent.
-
-    Args:
-        looks: looks of objects 1 and 2.
-        positions: positions ``(x, z)`` of objects 1 and 2.
-    """
+    """Initial state ``(52,)`` with a resting agent, from looks and positions ``(x, z)`` of objects 1 and 2."""
     state = np.zeros(INITIAL, dtype=np.float32)
     state[:3] = AGENT_START
     state[6] = 1  # no rotation
@@ -207,11 +178,7 @@ def looks(initial: Sequence[float] | NDArray[np.float32]) -> list[Look]:
 
 
 def target(task: str, initial_states: Tensor) -> Tensor:
-    """Index of the target ``(scene,)``, int64 0 or 1.
-
-    Args:
-        task: see :func:`parse`.
-        initial_states: ``(scene, 52)``.
+    """Index of the target ``(scene,)`` in initial states ``(scene, 52)``, int64 0 or 1.
 
     Raises:
         UserError: if a scene does not contain exactly one target.
@@ -233,7 +200,7 @@ def object_positions(initial_states: Tensor) -> Tensor:
 
 
 def check(initial: Sequence[float] | NDArray[np.float32]) -> NDArray[np.float32]:
-    """Validate an initial state and return it as an array.
+    """Return an initial state as an array.
 
     Raises:
         UserError: for a wrong size, numbers that are not finite, or bodies that overlap.
@@ -250,9 +217,5 @@ def check(initial: Sequence[float] | NDArray[np.float32]) -> NDArray[np.float32]
 
 
 def check_simulator() -> None:
-    """Check that pybullet is installed.
-
-    Raises:
-        UserError: with the command that installs it.
-    """
+    """Raise a ``UserError`` with the command that installs pybullet, if it is missing."""
     check_extra("navigation", "domain agent: its simulator")

@@ -12,11 +12,9 @@ from ftl_lightning.domains.recorder import Numbers, Piece, Scene, at_even_steps,
 from ftl_lightning.services.errors import require
 
 BRAKING = 20
-"""States of a demonstration reserved for braking."""
-LONGEST = (LENGTH - BRAKING) * STEP * SPEED
-"""Maximum length of a route in metres."""
-SHORTEST = 0.1
-"""Minimum length of a route in metres."""
+"""States reserved for braking."""
+LONGEST, SHORTEST = (LENGTH - BRAKING) * STEP * SPEED, 0.1
+"""Maximum and minimum length of a route in metres."""
 BLUR, CORNER = 0.08, 0.04
 """Standard deviation of the smoothing along the route, and distance between its corners afterwards, in metres."""
 FINE = 0.005
@@ -24,11 +22,7 @@ FINE = 0.005
 
 
 def scene(task: str, seed: int) -> Scene:
-    """Top-view scene with the agent at its start.
-
-    Args:
-        task: task of the scene; '' for the first of the paper's compositions.
-        seed: seed of the scene.
+    """Top-view scene of a task with the agent at its start; for '', of the first of the paper's compositions.
 
     Raises:
         UserError: without the simulator, or for an invalid task.
@@ -43,12 +37,9 @@ def scene(task: str, seed: int) -> Scene:
 
 
 def record(scene_before: Scene, path: Numbers, seconds: Numbers) -> Demonstrations:
-    """Drive along the drawn route at the expert's speed, to just before the first object on it.
+    """Drive at the expert's speed along the drawn route ``(step, 1, 2)`` in metres, to just before the first object on it.
 
-    Args:
-        scene_before: scene before the drive.
-        path: ``(step, 1, 2)``, x and z in metres, clipped to the picture.
-        seconds: ignored, as the speed of the hand is not a property of the drive.
+    The route is clipped to the picture; the speed of the hand is ignored, as it is not a property of the drive.
 
     Raises:
         UserError: for a route shorter than :data:`SHORTEST`, or without the simulator.
@@ -56,8 +47,7 @@ def record(scene_before: Scene, path: Numbers, seconds: Numbers) -> Demonstratio
     assert scene_before.starts is not None  # set by `scene`
     world = scene_before.starts.observed[OBSERVED]
     start = world[:, list(PLANE)].double().numpy()
-    (left, right), (low, high) = SEEN
-    hand = np.concatenate((start, path[:, 0].clip((left, low), (right, high))))
+    hand = np.concatenate((start, path[:, 0].clip(*zip(*SEEN, strict=True))))
     length = reached(hand)[-1]
     require(length >= SHORTEST, "way", f"one of at least {SHORTEST:g} m", f"{length:.2f} m; lead the agent further")
     way = _before_objects(smoothed(hand, BLUR), object_positions(world)[0].double().numpy()[:, PLANE])

@@ -24,8 +24,8 @@ PAPER = _suite(COMPOSITIONS)
 VALIDATION = _suite(
     ("go to green cone", "go to purple sphere", "go to green sphere", "go to red cone", "go to yellow sphere", "go to purple bowl")
 )
-"""Other targets with distractors by the paper's rule: three new combinations of colour and shape (as in the paper's tasks), three
-from pretraining, each with a known and two new distractors."""
+"""Other targets with distractors by the paper's rule: three new combinations of colour and shape, three from pretraining, each
+with a known and two new distractors."""
 
 
 def _parts(task: str) -> tuple[str, str]:
@@ -55,8 +55,7 @@ COMPOSED = Suite(
         EvaluationTask("new + training", "go to purple bowl", learned=("go to purple object",), texts=("go to bowl",)),
     )
 )
-"""Targets of the validation suite as compositions of colour and shape: two concepts learned separately, or a learned and a training
-concept. For tuning, like the validation suite."""
+"""Targets of the validation suite as compositions of colour and shape, one or both learned; for tuning."""
 
 SUITES = {"training": TRAINING, "paper": PAPER, "components": COMPONENTS, "validation": VALIDATION, "compositions": COMPOSED}
 

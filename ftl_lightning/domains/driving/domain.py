@@ -16,30 +16,7 @@ from ftl_lightning.data.features import InitialStates, Observed
 from ftl_lightning.data.formats.files import cached
 from ftl_lightning.domains.comparison import Comparison, Paper
 from ftl_lightning.domains.domain import Concepts, Domain, Plans, Split, deferred
-from ftl_lightning.domains.driving.traffic import (
-    BELIEF,
-    FEATURES_SEEN,
-    HORIZON,
-    MAX_STEPS,
-    NAME,
-    NAMES,
-    PUBLISHED,
-    SIMULATION,
-    STATE,
-    STATE_NAMES,
-    STATE_UNITS,
-    STEP,
-    SUITES,
-    TRAFFIC,
-    TRAINING_CONCEPTS,
-    check_scenario,
-    check_simulator,
-    episode_seed,
-    initial_states,
-    origin,
-    scene,
-    training_set,
-)
+from ftl_lightning.domains.driving import traffic
 from ftl_lightning.domains.driving.views import VIEWS, drive, turned
 from ftl_lightning.domains.execution import ClosedLoop, Policy, Rollout
 from ftl_lightning.domains.pictures import Show
@@ -51,14 +28,12 @@ if TYPE_CHECKING:
     from ftl_lightning.domains.driving.environment import DrivingEnvironment
 
 Make = Callable[[str, InitialStates, Demonstrations | None, int], Policy | None]
-SHOWN = 100
-"""Demonstrations per training scenario for the look-up and the regressions."""
-MLP_STEPS = 400
+SHOWN = 100  # demonstrations per training scenario for the look-up and the regressions
 
 
 def _simulation(goal: str) -> "AbstractEnv":
     """highway-env's environment of a scenario."""
-    check_simulator()
+    traffic.check_simulator()
     from ftl_lightning.domains.driving.scenarios import make
 
     return make(goal)
@@ -83,7 +58,7 @@ def _random(goal: str, starts: InitialStates, demonstrations: Demonstrations | N
 
 def _transitions(goal: str, demonstrations: Demonstrations | None) -> tuple[Observed, Tensor]:
     """Observations ``(n, *shape)`` by name and next states ``(n, 7)`` of all steps of the demonstrations."""
-    known = training_set("train", SHOWN).select(goal) if demonstrations is None else demonstrations
+    known = traffic.training_set("train", SHOWN).select(goal) if demonstrations is None else demonstrations
     pairs = [(row, time) for row, length in enumerate(known.lengths.tolist()) for time in range(length - 1)]
     rows, times = torch.tensor(pairs).T
     return {name: values[rows, times] for name, values in known.observed.items()}, known.states[rows, times + 1]
@@ -92,25 +67,21 @@ def _transitions(goal: str, demonstrations: Demonstrations | None) -> tuple[Obse
 def _nearest(goal: str, starts: InitialStates, demonstrations: Demonstrations | None, seed: int) -> Policy:
     """Successor of the nearest demonstrated state."""
     seen, following = _transitions(goal, demonstrations)
-    places = seen[TRAFFIC][:, :STATE]
-    return lambda observed, rows, step: following[torch.cdist(observed[TRAFFIC][:, :STATE], places).argmin(dim=1)]
+    places = seen[traffic.TRAFFIC][:, : traffic.STATE]
+    return lambda observed, rows, step: following[torch.cdist(observed[traffic.TRAFFIC][:, : traffic.STATE], places).argmin(dim=1)]
 
 
 def _regression(fit: Callable[[Tensor, Tensor, torch.Generator], Callable[[Tensor], Tensor]]) -> Make:
-    """Predict drives ``(n, 4)`` from the models' view of the observations.
-
-    Args:
-        fit: ``(inputs (n, 35), drives (n, 4), generator) -> prediction``, both arguments standardised.
-    """
+    """Predict drives ``(n, 4)`` from the models' view ``(n, 35)``; ``fit`` receives both standardised, and a generator."""
 
     def policy(goal: str, starts: InitialStates, demonstrations: Demonstrations | None, seed: int) -> Policy:
         seen, following = _transitions(goal, demonstrations)
         view = VIEWS["steps"].observe
-        inputs, drives = view(seen)[TRAFFIC], drive(seen[TRAFFIC][:, :STATE], following)
+        inputs, drives = view(seen)[traffic.TRAFFIC], drive(seen[traffic.TRAFFIC][:, : traffic.STATE], following)
         middle, spread = inputs.mean(dim=0), inputs.std(dim=0).clamp(min=1e-3)
         mean, scale = drives.mean(dim=0), drives.std(dim=0).clamp(min=1e-3)
         predict = fit((inputs - middle) / spread, (drives - mean) / scale, generator("cpu", seed))
-        return lambda observed, rows, step: predict((view(observed)[TRAFFIC] - middle) / spread) * scale + mean
+        return lambda observed, rows, step: predict((view(observed)[traffic.TRAFFIC] - middle) / spread) * scale + mean
 
     return policy
 
@@ -138,7 +109,7 @@ def _mlp(inputs: Tensor, drives: Tensor, draw: torch.Generator) -> Callable[[Ten
             layers += [weight.requires_grad_(), torch.zeros(after, requires_grad=True)]
         inputs, drives = inputs.clone(), drives.clone()
         optimizer = torch.optim.AdamW(layers, lr=3e-3, weight_decay=0.1)
-        for _ in range(MLP_STEPS):
+        for _ in range(400):
             optimizer.zero_grad()
             (predict(inputs) - drives).square().mean().backward()
             optimizer.step()
@@ -147,12 +118,12 @@ def _mlp(inputs: Tensor, drives: Tensor, draw: torch.Generator) -> Callable[[Ten
 
 def _expert(goal: str, starts: InitialStates, demonstrations: Demonstrations | None, seed: int) -> Policy | None:
     """Next state of the expert; not in training scenarios, where it takes minutes (see the data card for its rates)."""
-    if goal in TRAINING_CONCEPTS:
+    if goal in traffic.TRAINING_CONCEPTS:
         return None
-    check_simulator()
+    traffic.check_simulator()
     from ftl_lightning.domains.driving.expert import episode
 
-    drives = [torch.from_numpy(episode(*origin(start))[0][:, 0]) for start in starts.require_scenes().numpy()]
+    drives = [torch.from_numpy(episode(*traffic.origin(start))[0][:, 0]) for start in starts.require_scenes().numpy()]
     return lambda observed, rows, step: torch.stack([drives[row][min(step + 1, len(drives[row]) - 1)] for row in rows])
 
 
@@ -166,17 +137,12 @@ POLICIES = {
     "expert (oracle)": _expert,
 }
 """Baseline policies by name; all are subject to the planner's veto."""
-
-
 RENDERING = "ftl_lightning.domains.driving.rendering"
 
 
 class Expert:
-    """Source of successful episodes of the expert: shipped or new.
-
-    Args:
-        root: folder of user episodes of the training scenarios, instead of the shipped episodes.
-        blind: whether new episodes are of the expert that knows only observations.
+    """Source of successful episodes of the expert: shipped ones, those in ``root``, or new ones; blind: it knows only
+    observations.
     """
 
     def __init__(self, root: Path | None = None, blind: bool = False) -> None:
@@ -184,46 +150,46 @@ class Expert:
 
     def split(self, name: Split, count: int, seed: int) -> Demonstrations:
         """The same for every seed, as generation takes half an hour."""
-        return training_set(name, count, self.root)
+        return traffic.training_set(name, count, self.root)
 
     def draw(self, task: str, count: int, seed: int, workers: int = 1) -> Demonstrations:
-        check_scenario(task)
-        check_simulator()
+        traffic.check_scenario(task)
+        traffic.check_simulator()
         from ftl_lightning.domains.driving.expert import BLIND, SEARCH, demonstrations
         from ftl_lightning.domains.driving.scenarios import scenario
 
-        settings = {"domain": NAME, "task": task, "count": count, "seed": seed, "config": scenario(task).config}
-        settings |= {"search": SEARCH[task], "beyond": HORIZON, **({"blind": asdict(BLIND)} if self.blind else {})}
+        settings = {"domain": traffic.NAME, "task": task, "count": count, "seed": seed, "config": scenario(task).config}
+        settings |= {"search": SEARCH[task], "beyond": traffic.HORIZON, **({"blind": asdict(BLIND)} if self.blind else {})}
         return cached(settings, count, lambda progress: demonstrations(task, count, seed, workers, progress, self.blind))
 
     def starts(self, task: str, count: int, seed: int) -> InitialStates:
         """Initial states of new episodes, scenes ``(count, 37)``."""
-        env = _simulation(check_scenario(task))
+        env = _simulation(traffic.check_scenario(task))
         from ftl_lightning.domains.driving.scenarios import observe
 
         scenes = []
         for number in range(count):
-            start = episode_seed(seed, number)
+            start = traffic.episode_seed(seed, number)
             env.reset(seed=start)
-            scenes.append(torch.from_numpy(scene(observe(env), task, start)))
+            scenes.append(torch.from_numpy(traffic.scene(observe(env), task, start)))
         env.close()
-        return initial_states(torch.stack(scenes))
+        return traffic.initial_states(torch.stack(scenes))
 
 
-def environment(veto: str = BELIEF) -> "DrivingEnvironment":
+def environment(veto: str = traffic.BELIEF) -> "DrivingEnvironment":
     """Environment of the domain with a veto of the planner; raises a ``UserError`` without the simulator."""
-    check_simulator()
+    traffic.check_simulator()
     from ftl_lightning.domains.driving.environment import DrivingEnvironment
 
     return DrivingEnvironment(veto)
 
 
 def judge(goal: str, rollout: Rollout) -> dict[str, Tensor]:
-    """Outcomes of episodes.
+    """Outcomes of episodes ``(episode,)``, 0 for an aborted episode.
 
-    Returns:
-        ``(episode,)`` each: ``success``, the paper's criterion (roundabout: past it, crashed or not); ``strict success``, on the
-        right road without a crash; ``crash``; ``return``; ``length`` in steps. All are 0 for an aborted episode.
+    ``success`` is the paper's criterion (roundabout: past it, crashed or not), ``strict success`` on the right road without a
+    crash;
+    ``crash``, ``return``, and ``length`` in steps.
     """
     columns = {"success": "passed", "strict success": "arrived", "crash": "crashed", "return": "return", "length": "length"}
     outcomes = {name: torch.tensor([float(info.get(key, 0)) for info in rollout.infos]) for name, key in columns.items()}
@@ -231,10 +197,9 @@ def judge(goal: str, rollout: Rollout) -> dict[str, Tensor]:
 
 
 def distance(states: Tensor, others: Tensor) -> Tensor:
-    """Root mean square distance ``(a, b)`` in metres between paths of the controlled vehicle, relative to their initial poses."""
+    """Root mean square distance ``(a, b)`` in metres between paths relative to their initial poses."""
 
     def path(plans: Tensor) -> Tensor:
-        """Metres ``(plan, horizon, 2)`` along and across the initial heading."""
         first = plans[:, :1]
         return turned(plans[..., 1:3] - first[..., 1:3], first[..., 5], -first[..., 6])
 
@@ -242,36 +207,36 @@ def distance(states: Tensor, others: Tensor) -> Tensor:
 
 
 DOMAIN = Domain(
-    name=NAME,
-    plans=Plans(HORIZON, STATE_NAMES, STATE_UNITS, resolution=1e-3),
+    name=traffic.NAME,
+    plans=Plans(traffic.HORIZON, traffic.STATE_NAMES, traffic.STATE_UNITS, resolution=1e-3),
     concepts=Concepts(
-        training=TRAINING_CONCEPTS,
-        suites=SUITES,
-        descriptions=(*TRAINING_CONCEPTS, "roundabout", "roundabout third exit"),  # other scenarios use these concepts
-        reads=NAMES.__contains__,
+        training=traffic.TRAINING_CONCEPTS,
+        suites=traffic.SUITES,
+        descriptions=(*traffic.TRAINING_CONCEPTS, "roundabout", "roundabout third exit"),  # other scenarios use these concepts
+        reads=traffic.NAMES.__contains__,
         table=Path(__file__).parent / "embeddings.safetensors",
     ),
     source=Expert,
-    observed=FEATURES_SEEN,
+    observed=traffic.FEATURES_SEEN,
     show=Show(deferred(f"{RENDERING}:render"), vector_film=deferred(f"{RENDERING}:plan_film")),
     views=VIEWS,
     closed_loop=ClosedLoop(
         environment=environment,
-        identity=f"{BELIEF} veto",
-        others={f"{veto} veto": partial(environment, veto) for veto in (SIMULATION, STEP)},
+        identity=f"{traffic.BELIEF} veto",
+        others={f"{veto} veto": partial(environment, veto) for veto in (traffic.SIMULATION, traffic.STEP)},
         act=lambda plans, step, observed: plans[:, min(step + 1, plans.shape[1] - 1)],
-        steps=MAX_STEPS,
+        steps=traffic.MAX_STEPS,
         judge=judge,
         film=deferred(f"{RENDERING}:film"),
         vector_film=deferred(f"{RENDERING}:vector_film"),
         less_is_better=("crash",),
         policies=POLICIES,
-        expect=check_simulator,
+        expect=traffic.check_simulator,
     ),
     comparison=Comparison(
         headline="closed loop strict success",
         distance=distance,
         fresh=False,  # the expert takes about four seconds per episode
-        paper=Paper(PUBLISHED, omega="learned", ours="learned"),
+        paper=Paper(traffic.PUBLISHED, omega="learned", ours="learned"),
     ),
 )

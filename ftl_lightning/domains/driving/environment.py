@@ -9,64 +9,43 @@ import torch
 from highway_env.envs.common.abstract import AbstractEnv
 from numpy.typing import NDArray
 
+from ftl_lightning.domains.driving import traffic
 from ftl_lightning.domains.driving.foresight import VETOES, Beliefs, Worlds
 from ftl_lightning.domains.driving.scenarios import SCENARIOS, advance, arrived, make, observe
-from ftl_lightning.domains.driving.traffic import (
-    BELIEF,
-    FEATURES_SEEN,
-    MAX_STEPS,
-    NAMES,
-    OBSERVED,
-    SCENARIO,
-    SEEDS,
-    STATE,
-    TRAFFIC,
-    origin,
-    scene,
-)
 from ftl_lightning.domains.driving.views import drive
 from ftl_lightning.services.errors import require
 
-DRIVE = 4
-"""Columns of a drive."""
-Seen = dict[str, NDArray[np.float32]]
-"""Observed features by name."""
+DRIVE = 4  # columns of a drive
+Seen = dict[str, NDArray[np.float32]]  # observed features by name
 
 
 class DrivingEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
     """Driving scenarios; scenario and seed determine the initial state.
 
-    An observation is an initial state (37 numbers). An action is the desired state of the controlled vehicle after the step
-    (7 numbers), the desired drive (4, see :func:`~ftl_lightning.domains.driving.views.drive`) for policies that do not know the
-    road, or the number of a decision of the scenario (1). The planner selects the decisions of minimum risk
-    (:mod:`ftl_lightning.domains.driving.foresight`) and takes the nearest to the action (Euclidean, raw units), at random among
-    ties; it brakes if all crash. A numbered decision of higher risk is replaced by a random decision of minimum risk.
-
-    The last step's info contains ``crashed``, ``arrived`` (at the destination without a crash), ``passed`` (criterion of the
-    paper's code), ``return`` (sum of rewards) and ``length``.
+    An observation is an initial state (37 numbers). An action is the desired state after the step (7 numbers), the desired drive
+    (4,
+    see :func:`~ftl_lightning.domains.driving.views.drive`) for policies that do not know the road, or the number of a decision (1).
+    The planner selects the decisions of minimum risk (:mod:`ftl_lightning.domains.driving.foresight`) and takes the nearest to the
+    action (Euclidean, raw units), at random among ties; it brakes if all crash. A numbered decision of higher risk is replaced by a
+    random decision of minimum risk. The last step's info contains ``crashed``, ``arrived`` (at the destination without a crash),
+    ``passed`` (criterion of the paper's code), ``return`` (sum of rewards) and ``length``.
 
     Args:
         veto: ``'belief'``, ``'simulation'`` or ``'step'`` (the paper's); another raises a ``UserError``.
-
-    Attributes:
-        simulation: highway-env's environment of the scenario, after the first reset.
     """
 
     simulation: AbstractEnv
     metadata = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012 (gymnasium's)
     render_mode = "rgb_array"
     observation_space: gymnasium.spaces.Space[Any] = gymnasium.spaces.Dict(
-        {name: gymnasium.spaces.Box(-np.inf, np.inf, feature.shape, np.float32) for name, feature in FEATURES_SEEN.items()}
+        {name: gymnasium.spaces.Box(-np.inf, np.inf, feature.shape, np.float32) for name, feature in traffic.FEATURES_SEEN.items()}
     )
-    action_space = gymnasium.spaces.Box(-np.inf, np.inf, (STATE,), np.float32)
+    action_space = gymnasium.spaces.Box(-np.inf, np.inf, (traffic.STATE,), np.float32)
 
-    def __init__(self, veto: str = BELIEF) -> None:
+    def __init__(self, veto: str = traffic.BELIEF) -> None:
         require(veto in VETOES, "driving veto", f"one of {', '.join(VETOES)}", repr(veto))
-        self.veto = veto
-        self._name = ""
-        self._seed = 0
-        self._return = 0.0
-        self._length = 0
+        self.veto, self._name = veto, ""
+        self._seed, self._return, self._length = 0, 0.0, 0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Seen, dict[str, Any]]:
         """Reset to the initial state of ``options['scene']``, 37 numbers, or of a random seed in the scenario ``options['task']``.
@@ -78,9 +57,9 @@ class DrivingEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         options = options or {}
         given = options.get("scene")
         if given is None:
-            name, start = options.get("task", "roundabout"), int(self.np_random.integers(SEEDS))
+            name, start = options.get("task", "roundabout"), int(self.np_random.integers(traffic.SEEDS))
         else:
-            name, start = origin(np.asarray(given))
+            name, start = traffic.origin(np.asarray(given))
         if name != self._name:
             self.simulation, self._name = make(name), name
         super().reset(seed=start)  # for ties between decisions
@@ -88,27 +67,27 @@ class DrivingEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         self._seed, self._return, self._length = start, 0.0, 0
         self._beliefs = Beliefs(self.simulation, name)
         seen = observe(self.simulation)
-        same = given is None or np.allclose(scene(seen, name, start), given, atol=1e-3)
+        same = given is None or np.allclose(traffic.scene(seen, name, start), given, atol=1e-3)
         expected = f"the initial state of {name!r} for seed {start}"
         require(same, "driving scene", expected, "another; an episode cannot start in the middle of a drive")
         return self.observation(), {}
 
     def observation(self) -> Seen:
         """Current observation."""
-        number = np.array([NAMES.index(self._name)], dtype=np.float32)
-        return {TRAFFIC: observe(self.simulation).reshape(OBSERVED).astype(np.float32), SCENARIO: number}
+        number = np.array([traffic.NAMES.index(self._name)], dtype=np.float32)
+        return {traffic.TRAFFIC: observe(self.simulation).reshape(traffic.OBSERVED).astype(np.float32), traffic.SCENARIO: number}
 
     def step(self, action: NDArray[np.float32]) -> tuple[Seen, float, bool, bool, dict[str, Any]]:
         """Take a decision and simulate until the next."""
         wish = np.asarray(action, dtype=np.float64)
-        numbers = wish.shape in ((STATE,), (DRIVE,), (1,)) and np.isfinite(wish).all()
-        require(numbers, "driving action", f"{STATE} finite numbers, {DRIVE} or 1", wish.tolist())
+        numbers = wish.shape in ((traffic.STATE,), (DRIVE,), (1,)) and np.isfinite(wish).all()
+        require(numbers, "driving action", f"{traffic.STATE} finite numbers, {DRIVE} or 1", wish.tolist())
         chosen = self.decide(wish)
         reward, ended = advance(self.simulation, chosen)
         self._return += reward
         self._length += 1
-        info = self._outcome() if ended or self._length >= MAX_STEPS else {}
-        return self.observation(), reward, ended, self._length >= MAX_STEPS, info
+        info = self._outcome() if ended or self._length >= traffic.MAX_STEPS else {}
+        return self.observation(), reward, ended, self._length >= traffic.MAX_STEPS, info
 
     def decide(self, wish: NDArray[np.float64]) -> int:
         """Return the decision of minimum risk nearest to an action, see the class; the simulation is left unchanged."""
@@ -142,20 +121,13 @@ class DrivingEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         """Distances ``(decision,)`` of next states ``(decision, 7)`` after the present ``(7,)`` from the action."""
         if len(wish) == DRIVE:
             states = drive(torch.from_numpy(now).expand(len(states), -1), torch.from_numpy(states)).numpy()
-        distances: NDArray[np.float64] = np.linalg.norm(states - wish, axis=1)
-        return distances
+        return np.asarray(np.linalg.norm(states - wish, axis=1))
 
     def _outcome(self) -> dict[str, float]:
-        crashed = bool(self.simulation.vehicle.crashed)
-        there = arrived(self.simulation, self._name)
-        passed = SCENARIOS[self._name].passed
-        return {
-            "crashed": crashed,
-            "arrived": there and not crashed,
-            "passed": passed(self.simulation) if passed else there and not crashed,
-            "return": self._return,
-            "length": self._length,
-        }
+        crashed, passed = bool(self.simulation.vehicle.crashed), SCENARIOS[self._name].passed
+        there = arrived(self.simulation, self._name) and not crashed
+        outcome = {"crashed": crashed, "arrived": there, "passed": passed(self.simulation) if passed else there}
+        return outcome | {"return": self._return, "length": self._length}
 
     def render(self) -> NDArray[np.uint8]:
         """Top-view picture ``(height, width, 3)``."""

@@ -18,25 +18,9 @@ from highway_env.envs.common.abstract import AbstractEnv
 from numpy.typing import NDArray
 
 from ftl_lightning.data.demonstrations import Demonstrations
+from ftl_lightning.domains.driving import traffic
 from ftl_lightning.domains.driving.foresight import FRAMES, VETOES, Beliefs, Worlds, meaning
 from ftl_lightning.domains.driving.scenarios import SCENARIOS, Snapshot, advance, arrived, make, observe, restore, save
-from ftl_lightning.domains.driving.traffic import (
-    BELIEF,
-    FEATURES_SEEN,
-    HORIZON,
-    NAME,
-    NAMES,
-    OBSERVED,
-    SCENARIO,
-    STATE,
-    STATE_NAMES,
-    STATE_UNITS,
-    TRAFFIC,
-    VEHICLES,
-    decision_seconds,
-    episode_seed,
-    scene,
-)
 from ftl_lightning.services.errors import UserError, require
 from ftl_lightning.services.tensor_file import cache_folder, content_hash, load_tensors, save_tensors
 
@@ -50,8 +34,7 @@ class Search:
     Attributes:
         budget: simulated decisions per decision taken.
         gamma: discount; rewards are in [0, 1].
-        frequency: simulation frequency during search in Hz.
-        hold: steps per decision during search.
+        frequency, hold: simulation frequency in Hz and steps per decision during search.
         sight: distance in metres; farther vehicles are ignored during search.
     """
 
@@ -62,7 +45,7 @@ class Search:
     sight: float = math.inf
 
 
-SEARCH = dict.fromkeys(NAMES, Search(75, 0.9)) | {
+SEARCH = dict.fromkeys(traffic.NAMES, Search(75, 0.9)) | {
     "highway": Search(75, 0.7, sight=200),
     "exit": Search(200, 0.85, frequency=5, sight=120),
     "merge": Search(75, 0.7, frequency=5),
@@ -93,26 +76,20 @@ BLIND = Blind()
 def plan(env: AbstractEnv, name: str) -> int:
     """Return the next action; the environment is left unchanged.
 
-    A tree of action sequences grows at the leaf of highest optimistic value: its discounted return plus the maximum future reward,
-    1 per step. Once the budget is spent, the first action of the sequence with the highest return is taken.
+    A tree of action sequences grows at the leaf of highest optimistic value, its discounted return plus the maximum future reward,
+    until the budget is spent. The first action of the sequence with the highest return is taken.
     """
     search = SEARCH[name]
     with _searching(env, search):
         values = _values(env, name, search, env.get_available_actions(), search.budget)
-    return max(values, key=lambda action: values[action], default=IDLE)
+    return max(values, key=values.__getitem__, default=IDLE)
 
 
 def plan_blind(env: AbstractEnv, name: str, beliefs: Beliefs, rng: np.random.Generator) -> int:
-    """Return the next action of the blind expert; the environment is left unchanged.
+    """Return the next action of the blind expert, which searches sampled worlds; the environment is left unchanged.
 
-    The expert searches sampled worlds with the planner's veto. The value of an action is the mean return of its best sequence over
-    the worlds. The best action of tolerated risk is taken, else the best action of minimum risk.
-
-    Args:
-        env: the simulation.
-        name: name of the scenario.
-        beliefs: beliefs, updated for this decision.
-        rng: generator for sampled worlds.
+    The value of an action is the mean return of its best sequence over the worlds. The best action of tolerated risk is taken, else
+    the best action of minimum risk. Beliefs must be updated for this decision.
     """
     search, actual = SEARCH[name], save(env)
     actions = list({meaning(env, action): action for action in env.get_available_actions()[::-1]}.values())[::-1]
@@ -123,7 +100,7 @@ def plan_blind(env: AbstractEnv, name: str, beliefs: Beliefs, rng: np.random.Gen
             beliefs.draw(rng)
             for action in actions:
                 totals[action] += _values(env, name, search, [action], BLIND.expansions * len(actions))[action]
-    worlds = Worlds(env, VETOES[BELIEF], beliefs, rng)
+    worlds = Worlds(env, VETOES[traffic.BELIEF], beliefs, rng)
     risks: dict[int, float] = {}
     for action in sorted(actions, key=lambda action: -totals[action]):
         risks[action] = worlds.risk(action)
@@ -183,11 +160,7 @@ def _values(env: AbstractEnv, name: str, search: Search, first_actions: Sequence
 
 
 def drive(name: str, seed: int, env: AbstractEnv | None = None, blind: bool = False) -> tuple[NDArray[np.float32], bool]:
-    """Run an episode of the expert.
-
-    Returns:
-        Observations ``(time, 5, 7)``, and success: at the destination without a crash.
-    """
+    """Observations ``(time, 5, 7)`` of an episode of the expert, and success: at the destination without a crash."""
     env = env or make(name)
     env.reset(seed=seed)
     seen, ended = [observe(env)], False
@@ -201,21 +174,20 @@ def drive(name: str, seed: int, env: AbstractEnv | None = None, blind: bool = Fa
 
 
 KIND = "driving episode"
-MOST = 4
-"""Maximum number of episodes driven per kept episode."""
+MOST = 4  # episodes driven per kept episode
 
 
 def shard(name: str, seed: int, blind: bool = False) -> Path:
     """Cache file of an episode."""
-    belief = [BLIND.__dict__, VETOES[BELIEF].__dict__] if blind else []
+    belief = [BLIND.__dict__, VETOES[traffic.BELIEF].__dict__] if blind else []
     key = content_hash([name, SCENARIOS[name].config, SEARCH[name].__dict__, *belief])
-    return cache_folder() / f"{NAME}-{key}" / f"{seed}.safetensors"
+    return cache_folder() / f"{traffic.NAME}-{key}" / f"{seed}.safetensors"
 
 
 def episode(name: str, seed: int, blind: bool = False) -> tuple[np.ndarray, bool]:
     """Observations ``(time, 5, 7)`` and success of an expert episode, from the cache if present.
 
-    If the simulation raises an error, the episode counts as rejected and is not cached.
+    An error of the simulation rejects the episode, which is not cached.
 
     Raises:
         UserError: if the machine fails, independently of the episode.
@@ -233,17 +205,16 @@ def episode(name: str, seed: int, blind: bool = False) -> tuple[np.ndarray, bool
         raise UserError(f"driving {name!r}, seed {seed}: the machine failed ({error!r}); run it again, it goes on here") from error
     except Exception as error:  # errors of the simulation: continue with further episodes
         _LOG.warning("driving %r, seed %d: %r; the episode counts as rejected and is not kept", name, seed, error)
-        return np.zeros((1, VEHICLES, STATE), dtype=np.float32), False
+        return np.zeros((1, traffic.VEHICLES, traffic.STATE), dtype=np.float32), False
     save_tensors(path, KIND, {"observations": torch.from_numpy(seen)}, {"succeeded": succeeded})
     return seen, succeeded
 
 
 def driven_on(seen: np.ndarray, name: str, length: int) -> np.ndarray:
-    """Extend observations ``(time, 5, 7)`` to ``length``: vehicles drive straight on after the end.
-
-    Plans extend beyond the end of an episode. Padding with standing vehicles would teach that episodes end with a stop.
+    """Extend observations ``(time, 5, 7)`` to ``length``, straight on: standing vehicles would teach that episodes end with a
+    stop.
     """
-    times = decision_seconds(name) * np.arange(1, length - len(seen) + 1)[:, None, None]
+    times = traffic.decision_seconds(name) * np.arange(1, length - len(seen) + 1)[:, None, None]
     beyond = np.repeat(seen[-1:], len(times), axis=0)
     beyond[..., 1:3] += (times * beyond[..., 3:5]).astype(np.float32)
     return np.concatenate((seen, beyond))
@@ -253,8 +224,7 @@ def _episodes(name: str, seeds: list[int], workers: int, blind: bool) -> Iterato
     run = partial(episode, name, blind=blind)
     if workers == 1:
         yield from map(run, seeds)
-        return
-    # Only this process handles Ctrl-C; it then ends the workers.
+        return  # below, only this process handles Ctrl-C; it then ends the workers
     with multiprocessing.get_context("spawn").Pool(workers, signal.signal, (signal.SIGINT, signal.SIG_IGN)) as pool:
         yield from pool.imap(run, seeds)
 
@@ -262,16 +232,14 @@ def _episodes(name: str, seeds: list[int], workers: int, blind: bool) -> Iterato
 def demonstrations(
     name: str, count: int, seed: int, workers: int, progress: Callable[[], None], blind: bool = False
 ) -> Demonstrations:
-    """The first ``count`` successful episodes of a scenario in order of their seeds, for any number of workers.
-
-    ``progress`` is called after each successful episode.
+    """The first ``count`` successful episodes of a scenario in order of their seeds; ``progress`` is called after each.
 
     Raises:
         UserError: if too few episodes succeed.
     """
     kept: list[tuple[int, np.ndarray]] = []
     driven = 0
-    seeds = [episode_seed(seed, number) for number in range(MOST * count)]
+    seeds = [traffic.episode_seed(seed, number) for number in range(MOST * count)]
     for driven, (seen, succeeded) in enumerate(_episodes(name, seeds, workers, blind), start=1):
         if succeeded:
             kept.append((seeds[driven - 1], seen))
@@ -279,20 +247,20 @@ def demonstrations(
         if len(kept) == count:
             break
     require(len(kept) == count, f"driving {name!r}", f"{count} successful episodes of {driven}", len(kept))
-    longest = max(len(seen) for _, seen in kept) + HORIZON
+    longest = max(len(seen) for _, seen in kept) + traffic.HORIZON
     seen = np.stack([driven_on(seen, name, longest) for _, seen in kept])
-    traffic = torch.from_numpy(seen).float().flatten(2)
-    scenes = torch.from_numpy(np.stack([scene(seen[0], name, start) for start, seen in kept]))
-    provenance = {"generator": NAME, "seed": seed, "count": count, "driven": driven, "rejected": driven - count}
+    vehicles = torch.from_numpy(seen).float().flatten(2)
+    scenes = torch.from_numpy(np.stack([traffic.scene(seen[0], name, start) for start, seen in kept]))
+    provenance = {"generator": traffic.NAME, "seed": seed, "count": count, "driven": driven, "rejected": driven - count}
     return Demonstrations(
-        states=traffic[..., :STATE].contiguous(),
+        states=vehicles[..., : traffic.STATE].contiguous(),
         lengths=torch.tensor([len(seen) for _, seen in kept]),
-        domain=NAME,
-        state_names=STATE_NAMES,
-        state_units=STATE_UNITS,
+        domain=traffic.NAME,
+        state_names=traffic.STATE_NAMES,
+        state_units=traffic.STATE_UNITS,
         concepts=(name,) * count,
-        observed={TRAFFIC: traffic, SCENARIO: scenes[:, None, OBSERVED : OBSERVED + 1].repeat(1, longest, 1)},
-        per_step=tuple(FEATURES_SEEN),
+        observed={traffic.TRAFFIC: vehicles, traffic.SCENARIO: scenes[:, None, [traffic.OBSERVED]].repeat(1, longest, 1)},
+        per_step=tuple(traffic.FEATURES_SEEN),
         scenes=scenes,
         provenance=provenance | ({"expert": "blind"} if blind else {}),
     )

@@ -102,14 +102,21 @@ class FastNetwork(RoadNetwork):
         return nearest
 
 
+def _updated(vehicle: Any) -> bool:
+    """Update a vehicle's lane, if the network is a fast one."""
+    network = vehicle.road.network
+    if fast := type(network) is FastNetwork:
+        vehicle.lane_index = network.get_closest_lane_index(vehicle.position, vehicle.heading, vehicle.lane_index)
+        vehicle.lane = network.get_lane(vehicle.lane_index)
+    return fast
+
+
 class FastVehicle(IDMVehicle):
     """Other drivers."""
 
     position: Any
     impact: Any
     crashed: Any
-    lane_index: Any
-    lane: Any
 
     def act(self, action: Any = None) -> None:
         if self.crashed:
@@ -169,27 +176,16 @@ class FastVehicle(IDMVehicle):
             self.impact = None
         self.heading += self.speed * math.sin(beta) / (self.LENGTH / 2) * dt
         self.speed += self.action["acceleration"] * dt
-        network = self.road.network
-        if type(network) is FastNetwork:
-            self.lane_index = network.get_closest_lane_index(self.position, self.heading, self.lane_index)
-            self.lane = network.get_lane(self.lane_index)
-        else:
+        if not _updated(self):
             self.on_state_update()
 
 
 class FastController(MDPVehicle):
     """Controlled vehicle."""
 
-    lane_index: Any
-    lane: Any
-
     def on_state_update(self) -> None:
-        network = self.road.network
-        if type(network) is not FastNetwork or self.road.record_history:
+        if self.road.record_history or not _updated(self):
             super().on_state_update()
-            return
-        self.lane_index = network.get_closest_lane_index(self.position, self.heading, self.lane_index)
-        self.lane = network.get_lane(self.lane_index)
 
 
 class FastRoad(Road):
@@ -298,7 +294,7 @@ def accelerate(road: Road) -> None:
 
 
 MARGIN = 8.0
-"""Margin of circles around lanes in metres: gaps between sampled points, and inexact distances beyond the ends of sine lanes."""
+"""Metres around lanes for gaps between sampled points, and inexact distances beyond the ends of sine lanes."""
 
 
 def _circle(lane: Any) -> tuple[float, float, float]:

@@ -1,13 +1,8 @@
 """The planner's veto: risk of crashes within its look-ahead and knowledge.
 
-Three vetoes, shared by all methods and baselines:
-
-- ``step``: one-step look-ahead in the true simulation (the paper's);
-- ``simulation``: several decisions of look-ahead in the true simulation;
-- ``belief``: the same look-ahead in worlds sampled from observations, see :class:`Beliefs`.
-
-The risk of a decision is the share of worlds in which it, or everything that may follow it, crashes (compare the simulation and
-scoring of proposals in PDM-Closed; Dauner et al., 2023).
+Vetoes, shared by all methods and baselines: ``step``, one-step look-ahead in the true simulation (the paper's); ``simulation``,
+several decisions of look-ahead in it; ``belief``, the same in worlds sampled from observations, see :class:`Beliefs`. The risk of a
+decision is the share of worlds in which it, or everything that may follow it, crashes (compare PDM-Closed; Dauner et al., 2023).
 """
 
 import itertools
@@ -27,34 +22,26 @@ from ftl_lightning.domains.driving.traffic import BELIEF, SIMULATION, STEP
 
 @dataclass(frozen=True)
 class Foresight:
-    """Settings of a veto.
-
-    Attributes:
-        depth: decisions of look-ahead, including the first.
-        beliefs: number of sampled worlds; 0 for the true simulation.
-    """
+    """Decisions of look-ahead, including the first, and number of sampled worlds; 0 for the true simulation."""
 
     depth: int
     beliefs: int = 0
 
 
 VETOES = {BELIEF: Foresight(3, 8), SIMULATION: Foresight(3), STEP: Foresight(1)}
-FRAMES = 5
-"""Simulation frames per decision in sampled worlds."""
-SIGHT = 100.0
-"""Distance in metres within which other vehicles are part of sampled worlds."""
+FRAMES, SIGHT = 5, 100.0
+"""Simulation frames per decision, and distance in metres within which other vehicles are part, of sampled worlds."""
 AFTERWARDS = ("IDLE", "SLOWER", "FASTER", "LANE_LEFT", "LANE_RIGHT")
 """Follow-up decisions, in the order in which they are tried."""
-Meaning = tuple[float, tuple[str, str, int]]
-"""Target speed and lane."""
+Meaning = tuple[float, tuple[str, str, int]]  # target speed and lane
 
 
 class Beliefs:
     """Beliefs about the other vehicles of a scenario, from their present and past observations.
 
-    Position, heading, speed and crash are observed. Destination, IDM exponent, desired speed and lane changes are hidden. A belief
-    samples the destination uniformly from those still reachable in the scenario, and the exponent from highway-env's range. The
-    desired speed is the highest observed speed; vehicles keep their lane. Vehicles that appear later are unknown too.
+    Position, heading, speed and crash are observed. A belief samples the destination uniformly from those still reachable, and the
+    IDM exponent from highway-env's range. The desired speed is the highest observed speed; vehicles keep their lane. Vehicles that
+    appear later are unknown.
     """
 
     def __init__(self, env: AbstractEnv, name: str) -> None:
@@ -80,21 +67,14 @@ class Beliefs:
     def draw(self, rng: np.random.Generator) -> None:
         """Replace the simulation's state by a sampled world: other vehicles and random state."""
         env, road = self._env, self._env.road
-        others = [self._believed(vehicle, rng) for vehicle in self._others()]
-        road.vehicles = [env.vehicle, *others]
+        road.vehicles = [env.vehicle, *[self._believed(vehicle, rng) for vehicle in self._others()]]
         env.steps = road.steps = 0
         env.np_random.bit_generator.state = np.random.default_rng(rng.integers(2**32)).bit_generator.state
 
     def _believed(self, vehicle: Any, rng: np.random.Generator) -> Any:
-        driver = type(vehicle)(
-            vehicle.road,
-            vehicle.position.copy(),
-            vehicle.heading,
-            vehicle.speed,
-            target_speed=max(self._fastest[vehicle], self._scenario.cruise),
-            enable_lane_change=vehicle.enable_lane_change,
-            timer=rng.uniform(),
-        )
+        wanted, changes = max(self._fastest[vehicle], self._scenario.cruise), vehicle.enable_lane_change
+        pose = vehicle.road, vehicle.position.copy(), vehicle.heading, vehicle.speed
+        driver = type(vehicle)(*pose, target_speed=wanted, enable_lane_change=changes, timer=rng.uniform())
         driver.check_collisions, driver.crashed = vehicle.check_collisions, vehicle.crashed
         driver.DELTA = rng.uniform(*driver.DELTA_RANGE)
         network, passed = vehicle.road.network, self._passed[vehicle]

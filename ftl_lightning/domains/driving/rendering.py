@@ -16,21 +16,16 @@ from ftl_lightning.data.features import InitialStates, check_starts, take
 from ftl_lightning.domains.driving.traffic import NAMES, SCENARIO, TRAFFIC, VEHICLES, check_simulator, decision_seconds
 from ftl_lightning.domains.execution import Rollout
 from ftl_lightning.domains.films import Shape, VectorFilm, still
+from ftl_lightning.domains.pictures import PLAIN, RIGHT, WRONG
 from ftl_lightning.services.text import figure_text
 
 MAX_COLUMNS, MAX_PANELS = 4, 8
-BETWEEN = 4
-"""Frames per decision in films of episodes."""
-EGO, OTHER, ROAD, PLAN = "#2f8f57", "#3f6fb5", "#d8d8d8", "#e4704a"
-MARK = "#f4f4f4"
-"""Colour of lane centre lines."""
-RIGHT, WRONG = "#2e9e46", "#d03a3a"
+BETWEEN = 4  # frames per decision in films of episodes
+EGO, OTHER, ROAD, PLAN, MARK = "#2f8f57", "#3f6fb5", "#d8d8d8", "#e4704a", "#f4f4f4"
 LENGTH, WIDTH, LANE = 5.0, 2.0, 4.0
 """Length and width of a vehicle and width of a lane in metres."""
-MARGIN = 20.0
-"""Metres of road shown around moving objects."""
-MAX_ASPECT = 1.8
-"""Maximum aspect ratio of a picture."""
+MARGIN, MAX_ASPECT = 20.0, 1.8
+"""Metres of road shown around moving objects, and maximum aspect ratio of a picture."""
 AREA, PAGE = 9.0, 13.0
 """Area of a panel in square inches and width of a figure in inches."""
 PLAN_REACH = 25.0
@@ -53,12 +48,10 @@ def _lanes(name: str) -> tuple[NDArray[np.float64], ...]:
 
     env = make(name)
     env.reset(seed=0)
-    lanes = [
-        np.array([lane.position(s, 0) for s in np.linspace(0, min(lane.length, 1000), 60)])
-        for lane in env.road.network.lanes_list()
-    ]
+    known = env.road.network.lanes_list()
+    lanes = tuple(np.array([lane.position(s, 0) for s in np.linspace(0, min(lane.length, 1000), 60)]) for lane in known)
     env.close()
-    return tuple(lanes)
+    return lanes
 
 
 def _window(around: NDArray[np.float32]) -> Window:
@@ -68,13 +61,7 @@ def _window(around: NDArray[np.float32]) -> Window:
     return low - missing, high + missing
 
 
-def _draw(
-    axes: Axes,
-    name: str,
-    vehicles: NDArray[np.float32],
-    plan: NDArray[np.float32] | None,
-    window: Window,
-) -> None:
+def _draw(axes: Axes, name: str, vehicles: NDArray[np.float32], plan: NDArray[np.float32] | None, window: Window) -> None:
     """Draw lanes and vehicles ``(vehicle, 7)`` to scale, the controlled vehicle first."""
     low, high = window
     for lane in _lanes(name):
@@ -95,10 +82,7 @@ def _draw(
 
 
 def render(states: Tensor, right: Sequence[bool] | None, title: str, starts: InitialStates | None) -> Figure:
-    """Draw a grid of at most :data:`MAX_PANELS` scenes with their plans ``(scene, horizon, 7)``, to scale, and a legend.
-
-    Frames are green for right plans, red for wrong plans, and grey for ``None``.
-    """
+    """Draw a grid of at most :data:`MAX_PANELS` scenes with their plans ``(scene, horizon, 7)``, to scale, and a legend."""
     starts = check_starts(starts)
     shown = states[:MAX_PANELS].numpy()
     windows = [_window(plan[:, 1:3]) for plan in shown]
@@ -117,7 +101,7 @@ def render(states: Tensor, right: Sequence[bool] | None, title: str, starts: Ini
         vehicles = seen[TRAFFIC].unflatten(0, (VEHICLES, -1)).numpy()
         _draw(axes, NAMES[int(seen[SCENARIO].item())], vehicles, shown[number], windows[number])
         for spine in axes.spines.values():
-            spine.set(color="#8a8a8a" if right is None else RIGHT if right[number] else WRONG, linewidth=1.5)
+            spine.set(color=PLAIN if right is None else RIGHT if right[number] else WRONG, linewidth=1.5)
     figure.legend(handles=LEGEND, loc="outside lower center", ncols=len(LEGEND), frameon=False)
     return figure
 
@@ -134,8 +118,8 @@ def _driven(rollout: Rollout) -> tuple[str, NDArray[np.float32]]:
 def film(rollout: Rollout, plans: Tensor) -> list[NDArray[np.uint8]]:
     """Film an episode: frames ``(height, width, 3)``, :data:`BETWEEN` per decision, until nothing moves any more.
 
-    Positions are interpolated between decisions. The driven path is green, the current plan of ``plans (time, 8, 7)`` orange. The
-    caption shows scenario, time and speed, and in the last frame the outcome.
+    The driven path is green, the current plan of ``plans (time, 8, 7)`` orange. The caption shows scenario, time and speed, and in
+    the last frame the outcome.
     """
     name, traffic = _driven(rollout)
     end, ways = len(traffic), traffic[:, 0, 1:3]
@@ -169,12 +153,9 @@ def _between(before: NDArray[np.float32], after: NDArray[np.float32], part: floa
     return np.where((before[:, :1] > 0) & (after[:, :1] > 0), moved, before).astype(np.float32)
 
 
-PLAYED = 2.0
-"""Playback speed of vector films relative to real time."""
-FAR = 100.0
-"""Metres of road around moving objects in vector films; a page shows a part of it."""
-SAME = 12.0
-"""Maximum distance in metres from the predicted position to match a vehicle."""
+PLAYED, FAR = 2.0, 100.0
+"""Playback speed of vector films, and metres of road around moving objects in them; a page shows a part of it."""
+SAME = 12.0  # metres at most from the predicted position to match a vehicle
 
 
 def vector_film(rollout: Rollout) -> VectorFilm:
@@ -185,10 +166,8 @@ def vector_film(rollout: Rollout) -> VectorFilm:
 
 
 def plan_film(states: Tensor, starts: InitialStates | None) -> VectorFilm:
-    """Top-view film of a plan or demonstration ``(time, 7)``, a frame per state; other vehicles stay at their initial places.
-
-    Raises:
-        UserError: without the simulator, which provides the roads.
+    """Top-view film of a plan or demonstration ``(time, 7)`` among resting vehicles; raises a ``UserError`` without the
+    simulator.
     """
     seen = take(check_starts(starts).observed, 0)
     vehicles = seen[TRAFFIC].unflatten(0, (VEHICLES, -1)).numpy()

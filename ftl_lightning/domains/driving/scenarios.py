@@ -1,7 +1,6 @@
-"""The paper's driving scenarios as configurations and subclasses of highway-env, with their success criteria.
+"""The paper's driving scenarios as subclasses of highway-env (x right, y down, metres, m/s), with their success criteria.
 
-Axes: x right, y down, in metres; speeds in m/s. Importing this module registers each scenario with gymnasium as
-``ftl/driving-NAME-v0``.
+Importing this module registers each scenario with gymnasium as ``ftl/driving-NAME-v0``.
 """
 
 from collections.abc import Callable
@@ -69,7 +68,7 @@ class Exit(_Accelerated, ExitEnv):
 
 
 class Merge(_Accelerated, MergeEnv):
-    """Pass an access ramp: two lanes, three vehicles and a merging vehicle (paper's code; the paper's text says three lanes)."""
+    """Pass an access ramp: two lanes, three vehicles and a merging vehicle (the paper's text says three lanes)."""
 
     END = 320.0
 
@@ -137,8 +136,7 @@ def _on(*roads: tuple[str, str]) -> Callable[[AbstractEnv], bool]:
     return lambda env: tuple(env.vehicle.lane_index[:2]) in roads
 
 
-EXITS = ("exr", "sxr", "nxr")
-"""Exits of the roundabout for other vehicles."""
+EXITS = ("exr", "sxr", "nxr")  # of other vehicles in the roundabout
 
 
 def _other_roundabout(radius: int, lanes: int, vehicles: int) -> Scenario:
@@ -172,11 +170,7 @@ SCENARIOS = {
         cruise=8.0,
     ),
     "roundabout": Scenario(
-        Roundabout,
-        {"duration": 8},
-        _SECOND_EXIT,
-        passed=lambda env: bool(env.vehicle.position[1] < -20),
-        destinations=EXITS,
+        Roundabout, {"duration": 8}, _SECOND_EXIT, passed=lambda env: bool(env.vehicle.position[1] < -20), destinations=EXITS
     ),
     "roundabout third exit": Scenario(ThirdExit, {"duration": 10}, _on(("wx", "wxs"), ("wxs", "wxr")), destinations=EXITS),
     "roundabout of three lanes": _other_roundabout(radius=28, lanes=3, vehicles=7),
@@ -220,13 +214,7 @@ for _name in SCENARIOS:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """State that stepping changes, a hundred times cheaper than a deep copy of the simulation.
-
-    Attributes:
-        time, steps, road_steps: counters.
-        vehicles, objects: objects with copies of their attributes.
-        random: state of the random generator.
-    """
+    """State that stepping changes: counters, objects with copies of their attributes, and state of the random generator."""
 
     time: float
     steps: int

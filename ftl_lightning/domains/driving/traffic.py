@@ -16,30 +16,24 @@ from ftl_lightning.services.errors import require
 from ftl_lightning.services.shipped import check_extra
 
 NAME = "driving"
-HORIZON = 8
-"""States in a plan (paper)."""
-MAX_STEPS = 30
-"""Maximum number of decisions in an episode."""
-
+HORIZON = 8  # states in a plan (paper)
+MAX_STEPS = 30  # decisions in an episode
 FEATURES = ("presence", "x", "y", "vx", "vy", "cos_h", "sin_h")
 STATE = len(FEATURES)
 STATE_NAMES = tuple(f"ego.{feature}" for feature in FEATURES)
 STATE_UNITS = ("1", "m", "m", "m/s", "m/s", "1", "1")
 VEHICLES = 5
-"""Number of observed vehicles: the controlled vehicle and the four nearest that are not behind it."""
+"""Observed vehicles: the controlled vehicle and the four nearest that are not behind it."""
 OBSERVED = VEHICLES * STATE
 SCENE = OBSERVED + 2
 """Columns of a scene: the initial observation, scenario number and seed."""
 TRAFFIC, SCENARIO = "traffic", "scenario"
-"""Names of the observed features: vehicles ``(35,)`` and scenario number ``(1,)``, from which views derive the seconds per
-decision and whether the road is part of pretraining."""
+"""Names of the observed features: vehicles ``(35,)`` and scenario number ``(1,)``, which views read."""
 FEATURES_SEEN = {
     TRAFFIC: Feature((OBSERVED,), entities=tuple(tuple(range(start, start + STATE)) for start in range(STATE, OBSERVED, STATE))),
     SCENARIO: Feature((1,)),
 }
-SEEDS = 2**24
-"""Upper bound of seeds, exact in float32."""
-
+SEEDS = 2**24  # upper bound, exact in float32
 BELIEF, SIMULATION, STEP = "belief", "simulation", "step"
 """Names of the planner's vetoes, see :mod:`ftl_lightning.domains.driving.foresight`."""
 
@@ -82,11 +76,7 @@ def initial_states(scenes: Tensor) -> InitialStates:
 
 
 def origin(given: NDArray[np.float32]) -> tuple[str, int]:
-    """Scenario and seed of a scene.
-
-    Raises:
-        UserError: for a wrong size, or numbers that are not a scenario and seed.
-    """
+    """Scenario and seed of a scene; raises a ``UserError`` for a wrong size, or other numbers."""
     numbers = given.shape == (SCENE,) and np.isfinite(given).all()
     require(numbers, "driving scene", f"{SCENE} finite numbers", f"shape {given.shape}")
     number, seed = given[OBSERVED:].tolist()
@@ -104,20 +94,15 @@ SUITES = {
         tuple(EvaluationTask("other roundabout", name, learned=("roundabout",)) for name in OTHER_ROUNDABOUTS)
     ),
 }
-"""``validation`` is another route through the same roundabout. ``other roundabouts`` have other sizes, for the concept learned in
-the paper's roundabout; they are not used for tuning."""
+"""``validation`` is another route through the same roundabout; ``other roundabouts`` are not used for tuning."""
 
 
-SHIPPED = Path(__file__).parent / "demonstrations"
-"""Folder with a file of expert episodes per training scenario; see its data card."""
-HELD_OUT = 10
-"""Number of validation episodes per scenario, the last of its file."""
+SHIPPED = Path(__file__).parent / "demonstrations"  # a file of expert episodes per training scenario; see its data card
+HELD_OUT = 10  # validation episodes per scenario, the last of its file
 
 
 def training_set(name: Split, count: int, folder: Path | None = None) -> Demonstrations:
-    """The first ``count`` shipped episodes per training scenario; for ``'validation'``, held-out episodes.
-
-    ``folder`` has other episodes, a file per scenario as written by ``generate``.
+    """The first ``count`` shipped episodes per training scenario, or those of ``folder``; for ``'validation'``, held-out episodes.
 
     Raises:
         UserError: if there are fewer, or no file.
@@ -134,7 +119,7 @@ def training_set(name: Split, count: int, folder: Path | None = None) -> Demonst
 
 
 SUCCESS, CRASH = "closed loop success (step veto)", "closed loop crash (step veto)"
-_TABLE = (
+_TABLE = (  # guidance weight, method, success and crash rate (table 'Classifier-free guidance weight choice effect')
     ("1.2", OURS, 0.18, 0.38),
     ("1.4", OURS, 0.14, 0.40),
     ("1.6", OURS, 0.04, 0.48),
@@ -144,7 +129,6 @@ _TABLE = (
     ("learned", "CVAE", 0.24, 0.48),
     ("learned", "in-context", 0.0, 0.16),
 )
-"""Guidance weight, method, success rate and crash rate, of the table 'Classifier-free guidance weight choice effect'."""
 PUBLISHED = (
     *(
         Published(NEW, value, omega=omega, metric=metric, method=method)
@@ -153,7 +137,4 @@ PUBLISHED = (
     ),
     Published(NEW, 0.14, components=1, metric=SUCCESS),  # table 'Ablation on the number of learned concepts', K = 1
 )
-"""The paper's results, comparable with ours for one-step look-ahead.
-
-The success rate counts any vehicle past the roundabout, crashed or not.
-"""
+"""The paper's results, comparable with ours for one-step look-ahead; success is passing the roundabout, crashed or not."""

@@ -48,13 +48,10 @@ def drive(before: Tensor, after: Tensor) -> Tensor:
 
 
 SECONDS = torch.tensor([decision_seconds(name) for name in NAMES])
-"""Seconds between decisions by scenario number."""
 KNOWN = torch.tensor([name in TRAINING_CONCEPTS for name in NAMES])
-"""Whether a scenario is part of pretraining, by scenario number."""
+"""Seconds between decisions, and whether a scenario is part of pretraining, by scenario number."""
 NEAR = 20.0
-"""Distance scale in metres; larger distances are compressed, so that small gaps stay resolved."""
-_PAIRS = ((1, 3, 5), (2, 4, 6))
-"""Columns that share a scale: x and y of position, velocity and heading."""
+"""Distance scale in metres; larger distances are compressed."""
 
 
 def _vehicles(observed: Observed) -> Tensor:
@@ -68,7 +65,7 @@ def _near(places: Tensor) -> Tensor:
 
 
 def _observe_from_ego(observed: Observed) -> Observed:
-    """Position, speed and heading of the controlled vehicle, and the others relative to it, 0 where absent ``(7 + 4 * 7)``.
+    """Pose and speed of the controlled vehicle, and the others relative to it, 0 where absent ``(7 + 4 * 7)``.
 
     Position and heading are 0 on roads that are not part of pretraining, where they carry no learned information.
     """
@@ -128,8 +125,7 @@ def _act(plans: Tensor, step: int, observed: Observed) -> Tensor:
     return drive(plans[:, after - 1], plans[:, after])
 
 
-PERTURBATION = 4.0
-"""Standard deviation of the perturbed speed in m/s."""
+PERTURBATION = 4.0  # standard deviation of the perturbed speed in m/s
 
 
 def _perturb(states: Tensor, observed: Observed, draw: torch.Generator | None) -> tuple[Tensor, Observed]:
@@ -163,7 +159,7 @@ VIEWS = {
         decode=_decode_steps,
         perturb=_perturb,
         act=_act,
-        scales=_PAIRS,
+        scales=((1, 3, 5), (2, 4, 6)),
     ),
 }
 """``map`` is the paper's view. In ``steps``, constant motion has the same encoding on any road."""

@@ -34,15 +34,8 @@ def reads(task: str) -> bool:
 
 
 def succeeded(goal: str, states: Tensor, starts: InitialStates | None = None) -> Tensor:
-    """Whether every relation of a goal holds in its relaxed form (paper, 'Evaluation data and metrics').
-
-    Args:
-        goal: relations in words.
-        states: ``(sample, 1, 21)`` in the domain's units.
-        starts: unused.
-
-    Returns:
-        ``(sample,)`` of bool.
+    """Whether every relation of a goal holds in its relaxed form in states ``(sample, 1, 21)`` (paper, 'Evaluation data and
+    metrics').
     """
     return torch.stack([holds(relation, states[:, 0], relaxed=True) for relation in parse(goal)]).all(dim=0)
 

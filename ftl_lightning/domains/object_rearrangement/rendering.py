@@ -20,19 +20,11 @@ from ftl_lightning.domains.recorder import Numbers, Piece, Scene
 COLOURS = {"circle": "#e4704a", "triangle": "#4c9f70", "square": "#4a78c8"}
 CORNERS = {"triangle": 3, "square": 4}
 MAX_COLUMNS = 8
-MARGIN = 1.0
-"""Margin: the largest radius."""
+MARGIN = 1.0  # the largest radius
 
 
 def render(states: Tensor, right: Sequence[bool] | None, title: str, starts: InitialStates | None = None) -> Figure:
-    """Draw a grid of scenes.
-
-    Args:
-        states: ``(scene, 1, 21)`` in the domain's units.
-        right: whether the task holds in each scene (green and red frames); ``None`` for grey frames.
-        title: title above the grid.
-        starts: unused.
-    """
+    """Draw a grid of scenes ``(scene, 1, 21)``; frames are green where the task holds, red where not, grey for ``None``."""
     figure = framed(len(states), right, title, MAX_COLUMNS, (1.5, 1.5))
     for axes, state in zip(figure.axes, states[:, 0], strict=False):
         for shape, (x, y, radius, angle, *_) in zip(SHAPES, state.unflatten(0, (len(SHAPES), PER_SHAPE)).tolist(), strict=True):
@@ -60,12 +52,7 @@ def vector_film(states: Tensor, starts: InitialStates | None) -> VectorFilm:
 
 
 def scene(task: str, seed: int) -> Scene:
-    """Three shapes of new sizes without any training relation.
-
-    Args:
-        task: unused.
-        seed: seed of sizes, angles and places.
-    """
+    """Three shapes of new sizes without any training relation, for any task."""
     state = plain_scene(seed)
     places = state[list(CENTRES)].reshape(len(SHAPES), 2).tolist()
     pieces = tuple(Piece(shape, (x, y), (number,)) for number, (shape, (x, y)) in enumerate(zip(SHAPES, places, strict=True)))
@@ -73,12 +60,8 @@ def scene(task: str, seed: int) -> Scene:
 
 
 def record(initial: Scene, path: Numbers, seconds: Numbers) -> Demonstrations:
-    """Scene ``(1, 1, 21)`` with the shapes at their final places, centres clipped to [0, :data:`EXTENT`].
-
-    Args:
-        initial: initial scene.
-        path: ``(step, 3, 2)`` in length units; only the last step counts.
-        seconds: unused.
+    """Scene ``(1, 1, 21)`` with the shapes at the last places of a path ``(step, 3, 2)``, centres clipped to [0,
+    :data:`EXTENT`].
     """
     assert initial.state is not None  # set by `scene`
     state = initial.state.clone()

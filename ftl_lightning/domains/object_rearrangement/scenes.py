@@ -1,7 +1,6 @@
 """Spatial relations between the three shapes: grammar, exact form and relaxed form; generation of scenes.
 
-A task is a conjunction of relations in words (``'circle right of square and triangle above square'``), possibly negated
-(``'circle above square and not circle right of square'``).
+A task is a conjunction of relations in words, possibly negated (``'circle above square and not circle right of square'``).
 :func:`holds` defines each relation; generation, a vectorised rejection sampling, uses exact margins, evaluation relaxed margins
 (Netanyahu et al., 2024, appendix 'Object Rearrangement').
 """
@@ -25,27 +24,19 @@ PER_SHAPE = 4 + len(SHAPES)
 """Columns per shape: x, y, size, angle, one-hot type."""
 
 ORDERED_PAIRS = tuple(itertools.permutations(SHAPES, 2))
-AND = " and "
-"""Conjunction of relations in a task."""
-NOT = "not "
-"""Prefix of a negated relation."""
+AND, NOT = " and ", "not "
 PAIRWISE = ("right of", "above", "diagonal to", "antidiagonal to", "next to")
-RADIUS_TOLERANCE = 0.3
-"""Tolerance of a ring's circumradius in evaluation."""
-EXACT_TOLERANCE = 1e-3
-"""Tolerance of rings and lines in generated scenes, for rounding only."""
+RADIUS_TOLERANCE, EXACT_TOLERANCE = 0.3, 1e-3
+"""Tolerance of a ring's circumradius in evaluation, and of rings and lines in generated scenes."""
 NEXT_TO_GAP = (0.3, 0.8)
-"""Largest gap between two outlines that are 'next to' each other: exact, relaxed. A relation of the validation suite."""
-SIZE = (0.3, 1.0)
-"""Range of a shape's radius (paper)."""
-PROPOSALS = 32_768
-"""Scenes per proposal round."""
+"""Largest gap between two outlines that are 'next to' each other: exact, relaxed."""
+SIZE = (0.3, 1.0)  # range of a shape's radius (paper)
+PROPOSALS, PLAIN = 32_768, 256
+"""Scenes per proposal round of :func:`generate` and :func:`plain_scene`."""
 PATIENCE = 200
 """Maximum number of rounds before a task counts as infeasible."""
-PLAIN = 256
-"""Scenes per proposal round of :func:`plain_scene`."""
 _ALONG = {"diagonal to": (1 + 1j) / abs(1 + 1j), "antidiagonal to": (-1 + 1j) / abs(-1 + 1j)}
-"""Unit direction from B to A on a relation's line, as a complex number x + iy."""
+"""Unit direction x + iy from B to A on a relation's line."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +44,7 @@ class Relation:
     """Relation between shapes.
 
     Attributes:
-        kind: one of :data:`PAIRWISE`, or ``'ring'`` (all three shapes on the circumference of a circle).
+        kind: one of :data:`PAIRWISE`, or ``'ring'`` (all three shapes on a circle).
         shapes: ordered pair (A, B), or all three shapes for a ring.
         radius: circumradius of a ring, 0 otherwise.
         negated: whether the relation must not hold.
@@ -101,17 +92,7 @@ _RELATION = re.compile(f"(?P<negated>{NOT})?(?:{_PAIR}|{_RING})")
 
 
 def parse(task: str) -> tuple[Relation, ...]:
-    """Parse a task in words.
-
-    Args:
-        task: relations joined by ``' and '``.
-
-    Returns:
-        The relations in order.
-
-    Raises:
-        UserError: if a part is not a relation.
-    """
+    """Parse relations joined by ``' and '``; raise a ``UserError`` if a part is not a relation."""
     relations = []
     end = -len(AND)
     while end < len(task):
@@ -146,15 +127,8 @@ def circumradius(x: Tensor, y: Tensor) -> Tensor:
 
 
 def holds(relation: Relation, states: Tensor, relaxed: bool) -> Tensor:
-    """Whether a relation holds in each scene.
-
-    Args:
-        relation: the relation.
-        states: ``(scene, 21)`` in the domain's units.
-        relaxed: use margins of evaluation instead of generation. Negated relations always use the relaxed form.
-
-    Returns:
-        ``(scene,)`` of bool.
+    """Whether a relation holds in each scene ``(scene, 21)``, exactly or in the relaxed form of evaluation, as for any negated
+    one.
     """
     if relation.negated:
         return ~holds(relation.plain, states, relaxed=True)
@@ -192,16 +166,9 @@ def overlap(states: Tensor) -> Tensor:
 
 
 def generate(task: str, count: int, seed: int) -> Tensor:
-    """Draw scenes in which a task holds exactly, no shapes overlap and no unrelated training relation holds.
+    """Draw scenes ``(count, 21)`` in which a task holds exactly, no shapes overlap and no unrelated training relation holds.
 
-    Args:
-        task: relations in words, see :func:`parse`.
-        count: number of scenes.
-        seed: seed; the same task and seed give the same bytes.
-
-    Returns:
-        ``(count, 21)`` float32; for circle, triangle and square: x, y in [0, 5], radius in [0.3, 1], angle in [0, 2 pi],
-        one-hot type.
+    Columns of circle, triangle and square: x, y in [0, 5], radius in [0.3, 1], angle in [0, 2 pi], one-hot type. Deterministic.
 
     Raises:
         UserError: if the task cannot be parsed, or hardly any scene shows it.
@@ -240,9 +207,7 @@ def _related(relation: Relation) -> tuple[Relation, ...]:
 
 
 def _propose(relations: tuple[Relation, ...], rng: np.random.Generator) -> Tensor:
-    """Uniform scenes, at most ``(PROPOSALS, 21)``; centres are placed to satisfy relations of measure zero, rings first and
-    then moved rigidly.
-    """
+    """Uniform scenes, at most ``(PROPOSALS, 21)``, placed to satisfy relations of measure zero: rings, then moved rigidly."""
     scenes = _uniform_scenes(rng, PROPOSALS)
     wanted = sorted((relation for relation in relations if not relation.negated), key=lambda relation: relation.kind != "ring")
     on_ring = bool(wanted) and wanted[0].kind == "ring"
@@ -265,13 +230,7 @@ def _propose(relations: tuple[Relation, ...], rng: np.random.Generator) -> Tenso
 
 
 def _moved_onto(along: complex, centres: NDArray[np.float32], a: int, b: int) -> NDArray[np.float32]:
-    """Rotate and shift centres ``(scene, shape, 2)`` until A and B lie on a line, A further along it.
-
-    Args:
-        along: unit direction of the line, which passes through the middle of the square.
-        centres: centres of the shapes.
-        a, b: indices of A and B.
-    """
+    """Rotate and shift centres until A and B lie on a line through the square's middle, A further along the unit direction."""
     points = centres[..., 0] + 1j * centres[..., 1]
     way, middle = points[:, [a]] - points[:, [b]], (1 + 1j) * EXTENT / 2
     turned = (points - points[:, [a]]) * along * abs(way) / way

@@ -24,7 +24,6 @@ def _suite(compositions: tuple[str, ...], new_concepts: tuple[str, ...], with_tr
 
 
 TRAINING = training_suite(TRAINING_CONCEPTS)
-
 PAPER = _suite(
     compositions=(
         "triangle right of square and circle above square",
@@ -134,9 +133,8 @@ COMPOSITIONS = Suite(
         )
     )
 )
-"""Compositions beyond the validation suite: two of its learned concepts, a ring and a training concept, three training concepts (no
-two form a task of the paper), and a training concept without another that would often hold by chance (for the same two shapes none
-would). For tuning; learned concepts are shared with the validation suite."""
+"""Compositions beyond the validation suite, for tuning: two of its learned concepts, a ring and a training concept, three training
+concepts (no two form a task of the paper), and a training concept without another that would often hold by chance."""
 
 SUITES = {"training": TRAINING, "paper": PAPER, "components": COMPONENTS, "validation": VALIDATION, "compositions": COMPOSITIONS}
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import InitialStates, Observed
 from ftl_lightning.domains.comparison import Comparison, Paper, Published
-from ftl_lightning.domains.domain import EXECUTED, Concepts, Domain, Plans, Privileged, deferred
+from ftl_lightning.domains.domain import EXECUTED, Concepts, Domain, Plans, Privileged, Recordings, deferred
 from ftl_lightning.domains.execution import ClosedLoop, Policy, Rollout
 from ftl_lightning.domains.pictures import Show
 from ftl_lightning.domains.tabletop import interface
@@ -130,7 +130,7 @@ DOMAIN = Domain(
     concepts=Concepts(interface.TRAINING_CONCEPTS, interface.SUITES, table=_FOLDER / "embeddings.safetensors"),
     source=source,
     observed=interface.FEATURES,
-    privileged={interface.PLACES: Privileged(interface.SEEN, interface.misplaced, interface.told)},
+    recordings=Recordings(privileged={interface.PLACES: Privileged(interface.SEEN, interface.misplaced, interface.told)}),
     views=interface.VIEWS,
     show=Show(deferred(f"{RENDERING}:render"), vector_film=deferred(f"{RENDERING}:plan_film")),
     closed_loop=_LOOP,
