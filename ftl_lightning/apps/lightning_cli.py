@@ -65,11 +65,7 @@ class CommandLine(LightningCLI):
 
     @staticmethod
     def _expect_keys(known: Namespace, arguments: Sequence[str]) -> None:
-        """Refuse an unknown key without subkeys in a configuration, which jsonargparse accepts.
-
-        Raises:
-            ArgumentError: with the key.
-        """
+        """Refuse an unknown key without subkeys in a configuration, which jsonargparse accepts. Raise ArgumentError with the key."""
         for text in Arguments.read(arguments).values("config"):
             keys = OmegaConf.to_container(OmegaConf.create(text)) if ":" in text else {}
             for key in keys if isinstance(keys, dict) else ():
@@ -89,10 +85,8 @@ class CommandLine(LightningCLI):
             raise UserError(f"model.seed: expected {data} (data.seed), found {model}; give --seed_everything, which sets both")
 
     def _domains(self) -> list[str]:
-        """The domain in the configuration, if any, which a pretrained model's folder may then use.
-
-        Raises:
-            UserError: for a module that is neither installed nor trusted by the user.
+        """The domain in the configuration, if any, which a pretrained model's folder may then use. Raise UserError for a module
+        that is neither installed nor trusted by the user.
         """
         options = (self._get(self.config, "data") or {}).get("init_args") or {}
         domain = options.get("domain")
@@ -168,15 +162,13 @@ class CommandLine(LightningCLI):
 
 
 def _expect_values(key: str, values: Namespace | None, given: Sequence[str]) -> None:
-    """Refuse values that jsonargparse accepts: null for an argument without ``None``, and abbreviated names in option groups.
+    """Refuse values that jsonargparse accepts: null for an argument without ``None``, and abbreviated names in option groups. Raise
+    ArgumentError with the key.
 
     Args:
         key: ``model`` or ``data``.
         values: parsed values.
         given: names of options on the command line.
-
-    Raises:
-        ArgumentError: with the key.
     """
     if values is None or "class_path" not in values:
         return
@@ -201,8 +193,7 @@ def _expect_values(key: str, values: Namespace | None, given: Sequence[str]) -> 
             raise ArgumentError(None, f'Key "{key}.{name}": expected a value, found null')
 
 
-GROUPS = ("adapter", "budget", "codes", "embeddings", "loss", "modes", "weights")
-"""Option groups of shipped modules."""
+GROUPS = ("adapter", "budget", "codes", "embeddings", "loss", "modes", "weights")  # option groups of shipped modules
 
 
 def _null_in_groups(arguments: Arguments) -> Arguments:
@@ -268,10 +259,8 @@ PACKAGES = ("ftl_lightning", "lightning", "lightning_fabric", "pytorch_lightning
 
 
 def _expect_trusted(verb: str, arguments: Arguments) -> None:
-    """Allow a configuration only classes of packages that are installed or trusted by the user.
-
-    Raises:
-        UserError: with file, key and module of another class.
+    """Allow a configuration only classes of packages that are installed or trusted by the user. Raise UserError with file, key and
+    module of another class.
     """
     packages = set(PACKAGES)
     sources = [(str(path), keys) for given in arguments.configurations() for path, keys in parts(given, verb)]

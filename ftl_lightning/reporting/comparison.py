@@ -33,8 +33,7 @@ from ftl_lightning.reporting.table import (
 from ftl_lightning.reporting.tables import against, as_learned_most
 from ftl_lightning.training.method import load_method
 
-BASELINES = tuple(load_method(name).name for name in ("bc", "cvae", "in_context", "language"))
-"""Names of the paper's baselines."""
+BASELINES = tuple(load_method(name).name for name in ("bc", "cvae", "in_context", "language"))  # names of the paper's baselines
 LANGUAGE = BASELINES[-1]
 METHODS = (
     PAPERS_METHOD,
@@ -44,14 +43,10 @@ METHODS = (
     Compared(FINE_TUNED),
 )
 """Order of methods in tables; our other forms follow ours, other methods come last."""
-ALIKE = 0.9
-"""Minimum share of episodes with our outcome for which a reference policy is annotated."""
-LINES = 10
-"""Maximum number of lines of the short overview."""
-MEASURED = ("measured", "spread over seeds")
-"""Columns of a number in the comparison."""
-OTHER_FORMS = "other forms"
-"""Column of our forms other than the paper's."""
+ALIKE = 0.9  # minimum share of episodes with our outcome for which a reference policy is annotated
+LINES = 10  # maximum number of lines of the short overview
+MEASURED = ("measured", "spread over seeds")  # columns of a number in the comparison
+OTHER_FORMS = "other forms"  # column of our forms other than the paper's
 
 
 def all_methods(comparison: pd.DataFrame, ablations: pd.DataFrame) -> pd.DataFrame:

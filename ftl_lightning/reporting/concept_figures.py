@@ -15,8 +15,7 @@ from ftl_lightning.services.text import figure_text
 from ftl_lightning.training.checks import Check
 from ftl_lightning.training.concept_model import ConceptModel
 
-MOST = 20
-"""Maximum number of concepts in the figure of a check."""
+MOST = 20  # maximum number of concepts in the figure of a check
 GOOD, ODD = "#3f6fb5", "#d03a3a"
 
 
@@ -42,15 +41,13 @@ class Place:
 
 
 def concept_places(model: ConceptModel, concepts: Sequence[Concept], seed: int = 0) -> list[Place]:
-    """t-SNE of training concepts and learned components (paper, figure 'tsne'; van der Maaten & Hinton, 2008), in this order.
+    """t-SNE of training concepts and learned components (paper, figure 'tsne'; van der Maaten & Hinton, 2008), in this order. Raise
+    UserError if scikit-learn is missing.
 
     Args:
         model: the pretrained model.
         concepts: concepts learned with it.
         seed: seed of t-SNE.
-
-    Raises:
-        UserError: if scikit-learn is missing.
     """
     check_extra("notebooks", "concept_map")
     from sklearn.manifold import TSNE

@@ -39,15 +39,11 @@ OF_METHODS: Mapping[Compared, str] = {
 """Colour of each method, the same in all figures: Okabe and Ito's (2008) and Tol's (2021), safe for colour-blind readers."""
 SPARE = ("#117733", "#ddcc77", "#88ccee", "#555555")
 """Colours of user methods, used before colours of methods that a figure lacks."""
-COLOURS = (*dict.fromkeys(OF_METHODS.values()), *SPARE)
-"""Colours in order, for lines that are not methods."""
+COLOURS = (*dict.fromkeys(OF_METHODS.values()), *SPARE)  # colours in order, for lines that are not methods
 PAPER_COLOUR = "#9a9a9a"
-LINES = ("dotted", "dashed", "dashdot", (0, (1, 4)), (0, (6, 2, 1, 2, 1, 2)), "solid")
-"""Line styles of reference policies."""
-REFERENCE_MARKS = {REPLAYED: "X", FRESH: "*"}
-"""Markers of the reference lines of novelty and coverage."""
-WIDEST = 60.0
-"""Maximum width of a figure in inches; a figure of thousands of settings would fill the memory."""
+LINES = ("dotted", "dashed", "dashdot", (0, (1, 4)), (0, (6, 2, 1, 2, 1, 2)), "solid")  # line styles of reference policies
+REFERENCE_MARKS = {REPLAYED: "X", FRESH: "*"}  # markers of the reference lines of novelty and coverage
+WIDEST = 60.0  # maximum width of a figure in inches; a figure of thousands of settings would fill the memory
 
 
 def colours(named: Iterable[tuple[str, Compared]]) -> dict[str, str]:
@@ -158,10 +154,8 @@ def comparison_bars(domain: Domain, results: pd.DataFrame, metric: str = "accura
     return figure
 
 
-MARKS = "os^Pv*X<h>p8d"
-"""Markers of methods in the overview."""
-ROW = 0.5
-"""Height of a line of the overview in inches."""
+MARKS = "os^Pv*X<h>p8d"  # markers of methods in the overview
+ROW = 0.5  # height of a line of the overview in inches
 
 
 def overview_dots(results: pd.DataFrame) -> Figure:

@@ -22,12 +22,10 @@ from ftl_lightning.services.tensor_file import write_text
 from ftl_lightning.services.validation import from_mapping, read_json
 
 T = TypeVar("T")
-SPEED = "speed.json"
-"""File of accuracy over learning time in a folder of results; ``benchmarks/speed/speed.py`` writes it."""
+SPEED = "speed.json"  # file of accuracy over learning time in a folder of results; ``benchmarks/speed/speed.py`` writes it
 PUBLISHED, ONE, TEN = "published procedure, one concept", "ours, one concept", "ours, ten concepts together"
 """Names of the curves."""
-WITHIN = 0.02
-"""Tolerance below the final accuracy that counts as reached."""
+WITHIN = 0.02  # tolerance below the final accuracy that counts as reached
 FRONTIER = "frontier.json"
 """File of accuracy over coverage in a folder of results; ``benchmarks/experiments/frontier.py`` writes it."""
 NOISY = "demonstrations with noise"
@@ -40,7 +38,7 @@ COLUMNS = [*SUBJECT, *_MEASURES]
 
 
 def _read(path: str | Path, name: str, key: str, kind: Callable[..., T], expected: str) -> list[T]:
-    """Read the rows of a file; empty if there is no file.
+    """Read the rows of a file; empty if there is no file. Raise UserError for an invalid file, naming file and row.
 
     Args:
         path: the file, or its folder.
@@ -48,9 +46,6 @@ def _read(path: str | Path, name: str, key: str, kind: Callable[..., T], expecte
         key: key of the rows.
         kind: dataclass of a row; ``null`` counts as missing.
         expected: expected content, for messages.
-
-    Raises:
-        UserError: for an invalid file, naming file and row.
     """
     path = Path(path)
     path = path / name if path.is_dir() else path

@@ -11,14 +11,10 @@ from scipy.stats import binom
 from ftl_lightning.domains.comparison import Compared
 from ftl_lightning.evaluation.row import label
 
-LEVEL = 0.05
-"""Significance level of p."""
-EXACT = 20
-"""Maximum number of differences for the exact test."""
-DRAWS = 10_000
-"""Number of drawn sign patterns otherwise."""
-ROUNDING = 2e-6
-"""Tolerance for equal means; results have six digits."""
+LEVEL = 0.05  # significance level of p
+EXACT = 20  # maximum number of differences for the exact test
+DRAWS = 10_000  # number of drawn sign patterns otherwise
+ROUNDING = 2e-6  # tolerance for equal means; results have six digits
 AHEAD, BEHIND, UNSHOWN, UNDECIDED = "ahead", "behind", "no difference shown", "undecided"
 SAME = "the same in every task and seed"
 

@@ -18,12 +18,9 @@ from ftl_lightning.services.errors import UserError, require, shown
 from ftl_lightning.services.text import latex, latex_row, markdown, say
 
 MISSING = "-"
-PAPERS = ("paper", "difference")
-"""Columns of tables of domains with a paper."""
-MOST_COLUMNS = 8
-"""Maximum columns of a table in the documentation."""
-TRAINING, PAPER = "training", "paper"
-"""Suites that come first in reports, if a domain has them."""
+PAPERS = ("paper", "difference")  #: Columns of tables of domains with a paper.
+MOST_COLUMNS = 8  #: Maximum columns of a table in the documentation.
+TRAINING, PAPER = "training", "paper"  #: Suites that come first in reports, if a domain has them.
 
 
 @dataclass(frozen=True)
@@ -130,10 +127,8 @@ def beside_paper(number: Number | None, papers: Published | None) -> list[str]:
 
 
 def domain_of(name: str, rows: pd.DataFrame) -> Domain:
-    """The domain of results; for user data or a domain that is not installed, reconstructed from the rows.
-
-    Raises:
-        UserError: for a name that cannot be a folder of a report.
+    """The domain of results; for user data or a domain that is not installed, reconstructed from the rows. Raise UserError for a
+    name that cannot be a folder of a report.
     """
     is_name = re.fullmatch(r"\w[\w .+-]{0,99}", name)
     require(is_name, "results: column 'domain'", "a name of letters, digits and - . +", shown(name))

@@ -35,17 +35,12 @@ from ftl_lightning.reporting.table import (
 )
 from ftl_lightning.services.errors import UserError
 
-USUAL_K = 2
-"""Number of components in the main tables, as in the paper."""
-LEARNED = "learned"
-"""Value of ``omega`` for learned guidance weights."""
-AXES = {"demonstrations": "K", "K": "demonstrations"}
-"""Axes of curves: the varied column, and the column that stays fixed."""
-BESIDE = ("method", "measured", *PAPERS)
-"""Last columns of the tables of our method in all its forms."""
+USUAL_K = 2  #: Number of components in the main tables, as in the paper.
+LEARNED = "learned"  #: Value of ``omega`` for learned guidance weights.
+AXES = {"demonstrations": "K", "K": "demonstrations"}  #: Axes of curves: the varied column, and the column that stays fixed.
+BESIDE = ("method", "measured", *PAPERS)  #: Last columns of the tables of our method in all its forms.
 
-Papers = Callable[..., Published | None]
-"""The paper's number by the keyword ``method``."""
+Papers = Callable[..., Published | None]  #: The paper's number by the keyword ``method``.
 
 
 def labelled(rows: pd.DataFrame) -> pd.DataFrame:
@@ -205,10 +200,8 @@ def _outcomes(domain: Domain, rows: pd.DataFrame) -> list[Table]:
 
 
 def against(ours: pd.DataFrame, policy: str) -> tuple[int, int, int] | None:
-    """Episodes that only ours wins, episodes that only the policy wins from the same start, and all; ``None`` without rows.
-
-    Raises:
-        UserError: for counts that are impossible.
+    """Episodes that only ours wins, episodes that only the policy wins from the same start, and all; ``None`` without rows. Raise
+    UserError for counts that are impossible.
     """
     won, lost = (select(ours, metric=f"{begin}{policy}") for begin in (WON, LOST))
     if won.empty:

@@ -18,30 +18,23 @@ from ftl_lightning.services import trust
 from ftl_lightning.services.errors import UserError, require, short
 from ftl_lightning.services.tensor_file import write_text
 
-POLL = 0.5
-"""Seconds between two checks of the cells."""
-LOOK = 5.0
-"""Seconds between two checks of the cluster."""
-HEAD_WAIT = 20.0
-"""Maximum seconds without an answer of the head; Ray ends the process after 60 without a useful message."""
-NODE_WAIT = 60.0
-"""Maximum seconds that a cell waits for a machine that has left the cluster."""
-MOST_RUNS = 2
-"""Maximum runs of a cell, so that a cell that crashes machines does not crash them all."""
+POLL = 0.5  #: Seconds between two checks of the cells.
+LOOK = 5.0  #: Seconds between two checks of the cluster.
+HEAD_WAIT = 20.0  #: Maximum seconds without an answer of the head; Ray ends the process after 60 without a useful message.
+NODE_WAIT = 60.0  #: Maximum seconds that a cell waits for a machine that has left the cluster.
+MOST_RUNS = 2  #: Maximum runs of a cell, so that a cell that crashes machines does not crash them all.
 
 
 @contextmanager
 def cluster(address: str, attempt: Attempt, cells: Sequence[Cell] = ()) -> Iterator[Run]:
-    """Connect to a Ray cluster for the length of the block; an existing connection is used and stays open.
+    """Connect to a Ray cluster for the length of the block; an existing connection is used and stays open. Raise UserError if Ray
+    is missing, no cluster answers, or a cell fits on no machine.
 
     Args:
         address: ``'HOST:PORT'`` of the head; ``'auto'`` for the cluster of this machine; ``'local'`` for the processors of this
             machine; empty for Ray's order: ``RAY_ADDRESS``, else a cluster on this machine, else its processors.
         attempt: runs a cell on a machine of the cluster, in the current folder.
         cells: cells to run.
-
-    Raises:
-        UserError: if Ray is missing, no cluster answers, or a cell fits on no machine.
     """
     try:
         import ray
@@ -163,11 +156,7 @@ def _run(attempt: Attempt, cells: Sequence[Cell], known: set[str], tell: Tell) -
 
 
 def _check_room(cells: Sequence[Cell]) -> None:
-    """Refuse cells that fit on no machine of the cluster and would wait for ever.
-
-    Raises:
-        UserError: naming the first such cell.
-    """
+    """Refuse cells that fit on no machine of the cluster and would wait for ever. Raise UserError naming the first such cell."""
     nodes = _nodes()
     for cell in cells:
         require(

@@ -12,8 +12,7 @@ from typing import Any, Literal
 
 from ftl_lightning.services.errors import UserError, require, short
 
-CPUS, GPUS, MEMORY = "cpus", "gpus", "memory_gb"
-"""Resources of every cluster; others are custom resources of Ray."""
+CPUS, GPUS, MEMORY = "cpus", "gpus", "memory_gb"  #: Resources of every cluster; others are custom resources of Ray.
 GIGABYTE = 10**9
 _NAME = re.compile(r"[A-Za-z][\w.-]{0,63}")
 
@@ -36,11 +35,7 @@ class Resources:
 
     @classmethod
     def read(cls, amounts: Mapping[str, Any]) -> "Resources":
-        """Read resources from a configuration.
-
-        Raises:
-            UserError: for an invalid name or amount.
-        """
+        """Read resources from a configuration. Raise UserError for an invalid name or amount."""
         for name, amount in amounts.items():
             require(_NAME.fullmatch(name), "resources", f"{CPUS}, {GPUS}, {MEMORY} or a custom resource of the cluster", name)
             number = isinstance(amount, int | float) and not isinstance(amount, bool) and math.isfinite(amount) and amount >= 0
@@ -133,11 +128,7 @@ class Stage:
     resources: Mapping[str, float] = field(default_factory=dict)
 
     def cells(self, seed: int) -> Iterator[Cell]:
-        """The cells of a seed.
-
-        Raises:
-            UserError: without a configuration file, or for invalid resources.
-        """
+        """The cells of a seed. Raise UserError without a configuration file, or for invalid resources."""
         if self.seeds and seed not in self.seeds:
             return
         require(self.config, "config", "a configuration file or a list of them", "none")
@@ -165,11 +156,7 @@ def _filled(value: Any, names: Mapping[str, str]) -> str:
 
 
 def part(plan: Sequence[Sequence[Cell]], shard: str) -> list[list[Cell]]:
-    """Shard i of n (``'i/n'``) of a plan: every n-th cell, counted across stages.
-
-    Raises:
-        UserError: for an invalid shard.
-    """
+    """Shard i of n (``'i/n'``) of a plan: every n-th cell, counted across stages. Raise UserError for an invalid shard."""
     match = re.fullmatch(r"([1-9]\d*)/([1-9]\d*)", shard)
     if not match or int(match[1]) > int(match[2]):
         raise UserError(f"shard: expected 'number/shards' such as 3/8, found {short(shard)!r}")

@@ -49,8 +49,7 @@ class Outcome:
     node: str = ""
 
 
-Tell = Callable[[Cell, State, str, str], None]
-"""Callback for a new state of a cell, with machine and note."""
+Tell = Callable[[Cell, State, str, str], None]  #: Callback for a new state of a cell, with machine and note.
 Run = Callable[[Sequence[Cell], set[str], Tell], Iterator[tuple[Cell, Outcome]]]
 """Runs cells, given the configuration hashes that need not run; yields each cell with its outcome."""
 Attempt = Callable[[Cell, set[str], bool], Outcome]
@@ -84,11 +83,7 @@ def record_path(results: str | Path) -> Path:
 
 
 def read_record(results: str | Path) -> dict[str, CellRecord]:
-    """Read the entries by cell name; empty if there is no file.
-
-    Raises:
-        UserError: for a damaged file.
-    """
+    """Read the entries by cell name; empty if there is no file. Raise UserError for a damaged file."""
     path = record_path(results)
     if not path.exists():
         return {}

@@ -41,10 +41,8 @@ if TYPE_CHECKING:
 
 
 def check(cells: Sequence[Cell]) -> None:
-    """Check files, keys and encoder of each cell and, for ``invert``, domain, suites and model.
-
-    Raises:
-        UserError: all mistakes in one line; nothing was started.
+    """Check files, keys and encoder of each cell and, for ``invert``, domain, suites and model. Raise UserError with all mistakes in one
+    line; nothing was started.
     """
     made = {cell.options["model.output"] for cell in cells if cell.verb == "fit" and "model.output" in cell.options}
     mistakes = {}
@@ -97,7 +95,8 @@ def run_ablation(
 ) -> None:
     """Run all cells, stage after stage. A failed cell does not stop the others; failures are listed at the end.
 
-    The state of each cell is recorded beside the results, see :mod:`~ftl_lightning.apps.ablation.record`.
+    The state of each cell is recorded beside the results, see :mod:`~ftl_lightning.apps.ablation.record`. Raise UserError before
+    the first run, for cells that cannot run; at the end, naming failed cells.
 
     Args:
         plan: cells of each stage, in order; a stage may read files of earlier stages.
@@ -105,9 +104,6 @@ def run_ablation(
         executor: ``'local'`` runs cells one by one in this process; ``'ray'`` runs cells in parallel on a cluster whose machines
             share this folder. A cell that loses its process or machine runs once more.
         address: address of the Ray cluster, see :func:`~ftl_lightning.apps.ablation.cluster.cluster`.
-
-    Raises:
-        UserError: before the first run, for cells that cannot run; at the end, naming failed cells.
     """
     from ftl_lightning.evaluation.results import add_rows
 

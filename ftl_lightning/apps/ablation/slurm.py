@@ -15,14 +15,11 @@ from ftl_lightning.services import trust
 from ftl_lightning.services.errors import UserError, require, shown
 from ftl_lightning.services.tensor_file import write_text
 
-MOST_JOBS = 1000
-"""Maximum jobs of an array by Slurm's default."""
-RESERVED = ("array", "ntasks", "wrap")
-"""Options of sbatch that the scripts set."""
+MOST_JOBS = 1000  #: Maximum jobs of an array by Slurm's default.
+RESERVED = ("array", "ntasks", "wrap")  #: Options of sbatch that the scripts set.
 _CPUS = "cpus-per-task"
 _OPTION = re.compile(r"[a-z][a-z-]{0,39}")
-_VALUE = re.compile(r"[\w.,:/@%+=\[\]*-]{0,200}")
-"""Values of options: no characters that end a line or begin another word."""
+_VALUE = re.compile(r"[\w.,:/@%+=\[\]*-]{0,200}")  #: Values of options: no characters that end a line or begin another word.
 
 
 @dataclass(frozen=True)

@@ -19,23 +19,18 @@ from ftl_lightning.training.method import code_hash, load_method
 from ftl_lightning.version import __version__
 
 HASH = re.compile(r"[0-9a-f]{16}")
-NAME = re.compile(r"[\w .+()-]{1,60}")
-"""Allowed names of methods."""
-ROUNDING = 2e-6
-"""Tolerance for values rounded to six decimals."""
-ERRORS = 3
-"""Tolerance of rates in standard errors on another machine, where learning amplifies rounding."""
+NAME = re.compile(r"[\w .+()-]{1,60}")  # allowed names of methods
+ROUNDING = 2e-6  # tolerance for values rounded to six decimals
+ERRORS = 3  # tolerance of rates in standard errors on another machine, where learning amplifies rounding
 MOST_REFERENCES = 20
 
 
 def check_submission(path: Path) -> tuple[Submission, dict[str, BenchmarkSuite]]:
-    """Read a submission, and check its completeness and its agreement with itself and the frozen suites.
+    """Read a submission, and check its completeness and its agreement with itself and the frozen suites. Raise UserError naming the
+    file and the first error.
 
     Returns:
         The submission, and its suites by name.
-
-    Raises:
-        UserError: naming the file and the first error.
     """
     submission = Submission.load(path)
     with about(path):
@@ -184,10 +179,8 @@ def differences(run: Run, again: Run, suite: BenchmarkSuite, alike: bool) -> Ite
 def recompute(
     candidate: Candidate, submission: Submission, suites: Mapping[str, BenchmarkSuite], share: float, salt: str
 ) -> list[str]:
-    """Run a part of a submission again and return the differences.
-
-    Raises:
-        UserError: for another method, or one that cannot be run here.
+    """Run a part of a submission again and return the differences. Raise UserError for another method, or one that cannot be run
+    here.
     """
     method = load_method(candidate.method)
     expected = f"{submission.method!r}, the method of the submission"

@@ -22,13 +22,10 @@ from ftl_lightning.domains.domain import ACCURACY, Concepts, Domain, Generated, 
 from ftl_lightning.domains.tasks import EvaluationTask, Suite, training_suite
 from ftl_lightning.services.randomness import FRESH_SEED
 
-TEMPLATES, TEMPLATE_SEED = 80, 7_000_000
-"""Number of templates per kind, and their reserved seed."""
+TEMPLATES, TEMPLATE_SEED = 80, 7_000_000  # number of templates per kind, and their reserved seed
 CHANCE, ORACLE = "random kind (chance)", "generator (oracle)"
-Draw = Callable[[str, int, int], NDArray[np.float32]]
-"""``(kind, count, seed) -> (count, time, column)``."""
-Kind = Callable[[NDArray[np.float32]], Sequence[str]]
-"""``(samples (sample, time, column)) -> kind of each sample``."""
+Draw = Callable[[str, int, int], NDArray[np.float32]]  # ``(kind, count, seed) -> (count, time, column)``
+Kind = Callable[[NDArray[np.float32]], Sequence[str]]  # ``(samples (sample, time, column)) -> kind of each sample``
 
 
 def _rng(*words: object) -> np.random.Generator:

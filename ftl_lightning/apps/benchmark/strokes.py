@@ -14,17 +14,12 @@ from numpy.typing import NDArray
 
 from ftl_lightning.services.randomness import task_key
 
-STEPS = 40
-"""Number of points of a stroke."""
-TEMPLATES, TEMPLATE_SEED = 100, 5_000_000
-"""Number of templates per kind of :class:`Judge`, and their reserved seed."""
-RANDOM = "scribble"
-"""Kind without a common form: smooth curves and polylines through random corners."""
-MIRRORED, BACKWARDS = "mirrored ", "backwards "
-"""Prefixes of kinds that are mirrored left to right, or drawn from end to start."""
+STEPS = 40  #: Number of points of a stroke.
+TEMPLATES, TEMPLATE_SEED = 100, 5_000_000  #: Number of templates per kind of :class:`Judge`, and their reserved seed.
+RANDOM = "scribble"  #: Kind without a common form: smooth curves and polylines through random corners.
+MIRRORED, BACKWARDS = "mirrored ", "backwards "  #: Prefixes of kinds that are mirrored left to right, or drawn from end to start.
 
-Points = NDArray[np.float64]
-"""``(..., 2)``."""
+Points = NDArray[np.float64]  #: ``(..., 2)``.
 Shape = Callable[[Points], Points]
 """Path within about 1 of the origin: points ``(..., 2)`` at shares ``(...,)`` of the stroke, from 0 to 1."""
 
@@ -159,16 +154,11 @@ _TEST: dict[str, Shape] = {
 _CLOSED_KINDS = {"circle", "triangle", "figure eight", "square", "heart", *_CLOSED, "diamond", "drop", "hourglass"}
 _CLOSED_KINDS |= {"star", "house", "pentagon", "infinity"}
 """Closed strokes, which may begin slightly early or late and end before or beyond their beginning."""
-NEW = ("square", "heart", "S-curve")
-"""New kinds of :func:`strokes`."""
-TRAINING = tuple(kind for kind in SHAPES if kind not in NEW)
-"""Pretraining kinds of :func:`strokes`."""
-KNOWN = (*TRAINING, *_OPEN, *_CLOSED)
-"""Pretraining kinds of :func:`drawn`."""
-VALIDATION = (*NEW, *_VALIDATION)
-"""New kinds of :func:`drawn` for model selection."""
-TEST = tuple(_TEST)
-"""New kinds of :func:`drawn` for the final evaluation, used once."""
+NEW = ("square", "heart", "S-curve")  #: New kinds of :func:`strokes`.
+TRAINING = tuple(kind for kind in SHAPES if kind not in NEW)  #: Pretraining kinds of :func:`strokes`.
+KNOWN = (*TRAINING, *_OPEN, *_CLOSED)  #: Pretraining kinds of :func:`drawn`.
+VALIDATION = (*NEW, *_VALIDATION)  #: New kinds of :func:`drawn` for model selection.
+TEST = tuple(_TEST)  #: New kinds of :func:`drawn` for the final evaluation, used once.
 _SHAPES = SHAPES | _OPEN | _CLOSED | _VALIDATION | _TEST
 
 

@@ -16,10 +16,8 @@ from ftl_lightning.services.validation import from_mapping, read_json
 from ftl_lightning.version import __version__
 
 KIND, FORMAT = "few-shot concepts", 1
-MOST = 4 * 2**20
-"""Maximum size of a file in bytes; nine suites with three seeds need a twentieth."""
-PRETRAINED, GIVEN = "pretrained", "given"
-"""Origins of a model: pretrained in the run, or given."""
+MOST = 4 * 2**20  # maximum size of a file in bytes; nine suites with three seeds need a twentieth
+PRETRAINED, GIVEN = "pretrained", "given"  # origins of a model: pretrained in the run, or given
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,11 +122,7 @@ class Submission:
 
     @classmethod
     def load(cls, path: Path) -> "Submission":
-        """Read a file; nothing that it names is imported or opened.
-
-        Raises:
-            UserError: for an invalid file, naming file and key.
-        """
+        """Read a file; nothing that it names is imported or opened. Raise UserError for an invalid file, naming file and key."""
         check_readable(path, "submission", MOST)
         with about(path):
             return from_mapping(cls, read_json(path, "a submission"), "")

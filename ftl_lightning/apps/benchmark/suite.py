@@ -21,18 +21,12 @@ from ftl_lightning.version import __version__
 FOLDER = Path(__file__).parent / "suites"
 FAMILIES = {name: f"{__package__}.families:{name.upper()}" for name in ("beats", "pictures", "reaches", "strokes")}
 """References ``module:ATTRIBUTE`` of the benchmark's domains by short name: suites' files, which are hashed, name no module."""
-SEEDS = (0, 1, 2)
-"""Seeds of the protocol."""
-TOLERANCE = 1e-3
-"""Maximum relative difference of mean and mean square that is due to rounding on another processor."""
-TRAINING, DEMONSTRATIONS, VALIDATION, STARTS = "training", "demonstrations", "validation", "starts"
-"""Parts of a suite's data."""
-REQUIRED = (DEMONSTRATIONS, STARTS)
-"""Parts that every run draws, also without pretraining."""
-EXPORTED = (TRAINING, VALIDATION, DEMONSTRATIONS)
-"""Parts that :func:`write_data` writes."""
-FORMATS = ("npz", "safetensors", "lerobot", "minari")
-"""Formats of exported data."""
+SEEDS = (0, 1, 2)  # seeds of the protocol
+TOLERANCE = 1e-3  # maximum relative difference of mean and mean square that is due to rounding on another processor
+TRAINING, DEMONSTRATIONS, VALIDATION, STARTS = "training", "demonstrations", "validation", "starts"  # parts of a suite's data
+REQUIRED = (DEMONSTRATIONS, STARTS)  # parts that every run draws, also without pretraining
+EXPORTED = (TRAINING, VALIDATION, DEMONSTRATIONS)  # parts that :func:`write_data` writes
+FORMATS = ("npz", "safetensors", "lerobot", "minari")  # formats of exported data
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,10 +131,8 @@ class BenchmarkSuite:
         return FAMILIES.get(self.domain, self.domain)
 
     def loaded(self) -> Domain:
-        """Load the domain, and check that it has the concepts of the suite.
-
-        Raises:
-            UserError: for another version of the domain, or a missing simulator.
+        """Load the domain, and check that it has the concepts of the suite. Raise UserError for another version of the domain, or a
+        missing simulator.
         """
         domain = load_domain(self.domain_reference)
         with about(f"suite {self.name}"):
@@ -181,13 +173,11 @@ class BenchmarkSuite:
         return concatenate([source.draw(concept, self.demonstrations, DEMONSTRATION_SEED + seed) for concept in concepts])
 
     def check_data(self, seed: int, root: Path | None, parts: Sequence[str]) -> bool:
-        """Compare data with the frozen suite. Parts without a fingerprint are skipped.
+        """Compare data with the frozen suite. Parts without a fingerprint are skipped. Raise UserError for other data, with suite,
+        seed, part and both hashes.
 
         Returns:
             Whether the data are bit-identical; else they differ by rounding.
-
-        Raises:
-            UserError: for other data, with suite, seed, part and both hashes.
         """
         known = self.data.get(str(seed), {})
         drawn = self.fingerprints(seed, root, [part for part in parts if part in known])
@@ -207,11 +197,7 @@ def suite_names() -> tuple[str, ...]:
 
 
 def load_suite(name: str) -> BenchmarkSuite:
-    """Load a suite.
-
-    Raises:
-        UserError: for an unknown name or a damaged file.
-    """
+    """Load a suite. Raise UserError for an unknown name or a damaged file."""
     names = suite_names()
     require(name in names, "suites", f"some of {', '.join(names)}", short(name))
     path = FOLDER / f"{name}.json"

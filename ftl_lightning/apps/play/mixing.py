@@ -24,10 +24,8 @@ from ftl_lightning.services.errors import UserError, short
 from ftl_lightning.training.quality import judging_domain, right_plans
 
 Json = dict[str, Any]
-STEPS = 10
-"""Maximum number of sampling steps, so that a moving slider is answered at once."""
-JOINED = " and "
-"""Separator of the names of mixed concepts, for domains that read the result as a goal."""
+STEPS = 10  # maximum number of sampling steps, so that a moving slider is answered at once
+JOINED = " and "  # separator of the names of mixed concepts, for domains that read the result as a goal
 
 
 @dataclass(frozen=True)
@@ -58,10 +56,8 @@ def sampling_of(model: FewShot, temperature: float | None = None) -> dict[str, A
 
 
 def starts_of(model: FewShot, tasks: Sequence[str], count: int, seed: int) -> tuple[str, InitialStates | None]:
-    """Initial states of samples, and their task: the first that the domain reads; empty in domains without initial states.
-
-    Raises:
-        UserError: if the domain reads none of the tasks.
+    """Initial states of samples, and their task: the first that the domain reads; empty in domains without initial states. Raise
+    UserError if the domain reads none of the tasks.
     """
     if not model.domain.observed:
         return "", None
@@ -102,7 +98,8 @@ def judged(domain: Domain, plans: Demonstrations, goal: str) -> tuple[list[Json]
 
 
 def samples(model: FewShot, mixture: Mixture, asked: Sample, tasks: Sequence[str]) -> tuple[list[Json], str, Sampled]:
-    """Generate samples of a mixture, or episodes that execute it.
+    """Generate samples of a mixture, or episodes that execute it. Raise UserError for a task that the domain does not read, or if
+    behaviour cannot be executed.
 
     Args:
         model: generates the samples.
@@ -112,9 +109,6 @@ def samples(model: FewShot, mixture: Mixture, asked: Sample, tasks: Sequence[str
 
     Returns:
         Films, the judgement in words, and the settings of sampling.
-
-    Raises:
-        UserError: for a task that the domain does not read, or if behaviour cannot be executed.
     """
     judge = judge_of(model, mixture.examples)
     if asked.task:

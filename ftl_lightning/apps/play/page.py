@@ -34,18 +34,12 @@ POLICY = (
     "default-src 'none'; script-src 'nonce-{nonce}'; style-src 'nonce-{nonce}'; img-src data:; base-uri 'none'; form-action 'none'"
 )
 """Content security policy of every page: run its scripts, and load nothing."""
-WEIGHTS = (0.0, 0.5, 1.0, 1.5)
-"""Weights of each concept of a pair."""
-PAIRS, OTHERS = 4, 3
-"""Maximum number of pairs of concepts, and of training concepts mixed with a learned concept."""
-COUNT = 8
-"""Number of samples of each mixture."""
-MOST_SHOWN, MOST_CONCEPTS = 60, 100
-"""Maximum number of films per concept, and of concepts; the first are shown."""
-SAMPLES = 16
-"""Number of samples of a learned concept."""
-HEADER = 16 * 2**20
-"""Maximum bytes read to determine the kind of a file."""
+WEIGHTS = (0.0, 0.5, 1.0, 1.5)  # weights of each concept of a pair
+PAIRS, OTHERS = 4, 3  # maximum number of pairs of concepts, and of training concepts mixed with a learned concept
+COUNT = 8  # number of samples of each mixture
+MOST_SHOWN, MOST_CONCEPTS = 60, 100  # maximum number of films per concept, and of concepts; the first are shown
+SAMPLES = 16  # number of samples of a learned concept
+HEADER = 16 * 2**20  # maximum bytes read to determine the kind of a file
 
 
 def page(nonce: str, offline: bytes | None = None) -> str:
@@ -147,11 +141,7 @@ def holds_results(file: str) -> bool:
 
 
 def results_page(file: str) -> str:
-    """The page of ``report --html`` of some results.
-
-    Raises:
-        UserError: if there are no results.
-    """
+    """The page of ``report --html`` of some results. Raise UserError if there are no results."""
     from ftl_lightning.reporting.page import write_page
 
     with tempfile.TemporaryDirectory() as folder:
@@ -161,14 +151,11 @@ def results_page(file: str) -> str:
 
 
 def viewed(file: str, model: str = "") -> dict[str, Any]:
-    """State of the page for a file.
+    """State of the page for a file. Raise UserError naming the file, if it is none of these.
 
     Args:
         file: demonstrations, samples or a learned concept; the name or folder of a data set.
         model: model of a learned concept; empty to search for it.
-
-    Raises:
-        UserError: naming the file, if it is none of these.
     """
     path = Path(file)
     if path.suffix == ".safetensors":

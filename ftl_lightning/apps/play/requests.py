@@ -12,11 +12,7 @@ MOST_TEMPERATURE = 4.0
 
 
 def check_name(name: str) -> None:
-    """Refuse an invalid name.
-
-    Raises:
-        UserError: for an empty or too long name, or letters that cannot be printed.
-    """
+    """Refuse an invalid name. Raise UserError for an empty or too long name, or letters that cannot be printed."""
     require(1 <= len(name.strip()) <= MOST_NAME and name.isprintable(), "name", f"1 to {MOST_NAME} letters", len(name))
 
 

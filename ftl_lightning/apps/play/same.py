@@ -10,8 +10,7 @@ from typing import Any
 from ftl_lightning.igm.concept import file_name
 from ftl_lightning.igm.settings import INVERSION
 
-FOLDER = "concepts"
-"""Folder to which commands write learned concepts."""
+FOLDER = "concepts"  # folder to which commands write learned concepts
 VARIABLES = frozenset({"model", "mixed", "starts", "samples", "episodes", *keyword.kwlist})
 """Names that are not allowed as a concept's variable."""
 

@@ -25,12 +25,10 @@ from ftl_lightning.services.errors import UserError, mistake_of_machine, short
 from ftl_lightning.services.text import line, say
 
 LOOPBACK = "127.0.0.1"
-PORT = 8765
-"""Default port, unless another program uses it."""
+PORT = 8765  # default port, unless another program uses it
 MOST_CONNECTIONS, IDLE, PATIENCE = 200, 5, 3
 """Maximum number of connections, seconds before an idle connection is closed, and seconds for the last answers at the end."""
-TOKEN = "x-token"
-"""Header required in every request but the first."""
+TOKEN = "x-token"  # header required in every request but the first
 RECEIVE_SECONDS, END_SECONDS = 30.0, 0.25
 """Maximum seconds to receive a request, and seconds from the request to end the program to its end."""
 HEADERS: Mapping[str, str] = {
@@ -56,8 +54,7 @@ MISTAKES = (
     ValueError,
 )
 """Exceptions that are reported in one line. Starlette handles the class Exception outside of the guard, which adds headers."""
-Begin = Callable[[], Awaitable[Any]]
-"""Called at the start, while requests are already answered."""
+Begin = Callable[[], Awaitable[Any]]  # called at the start, while requests are already answered
 
 
 class Guard:
@@ -101,11 +98,7 @@ class Guard:
 
 
 async def body_of(request: Request, most: int) -> bytes:
-    """Read the bytes of a request.
-
-    Raises:
-        HTTPException: for more than ``most`` bytes, or if they take too long.
-    """
+    """Read the bytes of a request. Raise HTTPException for more than ``most`` bytes, or if they take too long."""
     message = f"expected at most {most // 2**20} MB, found more"
     length = request.headers.get("content-length", "0")
     if not length.isdecimal() or int(length) > most:
@@ -194,10 +187,8 @@ def serve(
     begin: Begin | None = None,
     close: Callable[[], None] = lambda: None,
 ) -> None:
-    """Serve a page until Ctrl-C, or until the page ends the program; ``close`` is called at the end.
-
-    Raises:
-        UserError: if the address is not available.
+    """Serve a page until Ctrl-C, or until the page ends the program; ``close`` is called at the end. Raise UserError if the address
+    is not available.
     """
     listening = _listening(place.host, place.port)
     port, names, token = listening.getsockname()[1], _names(place.host), secrets.token_urlsafe(24)

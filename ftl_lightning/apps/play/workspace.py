@@ -23,15 +23,12 @@ from ftl_lightning.igm.settings import PAPER
 from ftl_lightning.services.errors import UserError, require, short
 from ftl_lightning.services.tensor_file import kind_of
 
-SHOWN, SHOWN_FIRST = 8, 4
-"""Number of samples shown of a learned concept, and during learning."""
+SHOWN, SHOWN_FIRST = 8, 4  # number of samples shown of a learned concept, and during learning
 FIRST, INTERVAL, RATIO = 0.2, 0.5, 3.0
 """Seconds of learning before the first samples, minimum seconds between samples, minimum ratio of learning to sampling time."""
-REPORT = 0.05
-"""Minimum seconds between reported losses: each report takes time from learning."""
+REPORT = 0.05  # minimum seconds between reported losses: each report takes time from learning
 QUICK: Mapping[str, Any] = {"form": PAPER, "samples": 16, "learning_rate": 0.3}
-QUICK_STEPS = 250
-"""Steps of quick learning from a user's data; chosen on strokes, see docs/experiments-own-data.md."""
+QUICK_STEPS = 250  # steps of quick learning from a user's data; chosen on strokes, see docs/experiments-own-data.md
 
 Tell = Callable[[Json], None]
 
@@ -164,10 +161,8 @@ class Workspace:
         return self.work()
 
     def upload(self, name: str, content: bytes) -> None:
-        """Read a file of demonstrations, of a concept, or of another program.
-
-        Raises:
-            UserError: for another kind of file, or a file of another model or domain.
+        """Read a file of demonstrations, of a concept, or of another program. Raise UserError for another kind of file, or a file
+        of another model or domain.
         """
         ending, endings = Path(name).suffix.lower(), self._demonstrating.files
         require(ending in endings, "file", f"a name that ends in {' or '.join(endings)}", repr(short(name)))
@@ -177,10 +172,8 @@ class Workspace:
             self._demonstrating.read(name, content)
 
     def demonstrations_file(self, key: str) -> tuple[str, bytes]:
-        """Name and bytes of an ``.npz`` of the current demonstrations, or of those of a concept learned here.
-
-        Raises:
-            UserError: if there are none.
+        """Name and bytes of an ``.npz`` of the current demonstrations, or of those of a concept learned here. Raise UserError if
+        there are none.
         """
         if not key:
             return "demonstrations.npz", as_npz(self._demonstrating.together(""))
@@ -306,11 +299,7 @@ class Workspace:
     # Samples.
 
     def sample(self, request: requests.Sample) -> Json:
-        """Generate samples of a mixture.
-
-        Raises:
-            UserError: for an unknown concept or group, or if behaviour cannot be executed.
-        """
+        """Generate samples of a mixture. Raise UserError for an unknown concept or group, or if behaviour cannot be executed."""
         begin = monotonic()
         known = [self._known(part.id) for part in request.parts]
         width, plans = self._model.model.config.state_dim, self._domain.plans

@@ -20,15 +20,12 @@ from ftl_lightning.services.text import line
 from ftl_lightning.services.validation import from_mapping, read_json
 
 LISTING = "films.json"
-TRAINING, NEW = "training", "new"
-"""Settings: concepts of pretraining, and new concepts."""
-CHECKS = {"check-yes": "yes", "check-no": "no"}
-"""Pseudo-methods of films with an obvious answer, and that answer."""
+TRAINING, NEW = "training", "new"  #: Settings: concepts of pretraining, and new concepts.
+CHECKS = {"check-yes": "yes", "check-no": "no"}  #: Pseudo-methods of films with an obvious answer, and that answer.
 YES, NO = "yes", "no"
 DEPICTS, BEST = "depicts", "best"
 """The two questions of the paper: whether a film depicts a concept, and which of several films depicts it best."""
-CHECK, REPEAT = "check", "repeat"
-"""Questions with a known answer, and repeated questions about the same film."""
+CHECK, REPEAT = "check", "repeat"  #: Questions with a known answer, and repeated questions about the same film.
 INSTRUCTIONS = {YES: "This question checks attention: please answer Yes.", NO: "This question checks attention: please answer No."}
 
 
@@ -75,17 +72,15 @@ def read_films(folder: Path, domain: Domain, scenarios: int, seed: int) -> list[
     ``"setting"`` and ``"row"``, or only files named ``METHOD/CONCEPT.safetensors``. Files are outputs of ``sample --out``. The
     concept is read from the file, or else is the file's name, where an underscore is a space.
 
-    Rows are drawn at random, and are the same for all methods, because equal rows have the same initial state.
+    Rows are drawn at random, and are the same for all methods, because equal rows have the same initial state. Raise UserError for
+    a domain without films, for files that are missing, of another domain or without enough samples, and for a scenario that lacks a
+    method.
 
     Args:
         folder: folder of the user.
         domain: domain of the behaviour.
         scenarios: number of scenarios of each concept.
         seed: random seed of rows that are not listed.
-
-    Raises:
-        UserError: for a domain without films, for files that are missing, of another domain or without enough samples, and for a
-            scenario that lacks a method.
     """
     filmed = domain.show.film is not None or domain.show.wireframe is not None
     require(filmed, "domain", "a domain whose plans are filmed", f"{domain.name}, which has no films")

@@ -20,10 +20,8 @@ from ftl_lightning.services.text import line
 from ftl_lightning.services.validation import from_mapping, read_json
 
 ANSWERS_KIND = "study answers"
-REPEATS_THAT_MAY_DIFFER = 0.5
-"""Maximum fraction of repeated questions that an attentive rater may answer inconsistently."""
-LABELS = {BEST: "judged best", DEPICTS: "depicts the concept"}
-"""Labels of the questions, in the order of the paper's table."""
+REPEATS_THAT_MAY_DIFFER = 0.5  #: Maximum fraction of repeated questions that an attentive rater may answer inconsistently.
+LABELS = {BEST: "judged best", DEPICTS: "depicts the concept"}  #: Labels of the questions, in the order of the paper's table.
 NOTES = (
     "mean ± standard deviation over raters of each rater's mean over scenarios, as in the paper; in brackets Wilson's 95 %",
     "interval, which takes answers as independent and is too narrow where they are not; alpha: Krippendorff's, nominal",
@@ -107,11 +105,7 @@ def _json(path: Path, kind: str) -> dict[str, Any]:
 
 
 def read_key(path: Path) -> Key:
-    """Read the key written by ``study``.
-
-    Raises:
-        UserError: naming the file, if it is missing, damaged or of another kind.
-    """
+    """Read the key written by ``study``. Raise UserError naming the file, if it is missing, damaged or of another kind."""
     content = _json(path, KEY_KIND)
     with about(path):
         key = from_mapping(Key, {name: content[name] for name in ("study", "page", "questions", "films") if name in content}, "")
@@ -127,10 +121,8 @@ def read_key(path: Path) -> Key:
 
 
 def read_rater(path: Path, key: Key) -> Rater:
-    """Read one file of answers.
-
-    Raises:
-        UserError: naming the file, if it is missing, damaged, of another study, of another page, or not finished.
+    """Read one file of answers. Raise UserError naming the file, if it is missing, damaged, of another study, of another page, or
+    not finished.
     """
     content = _json(path, ANSWERS_KIND)
     for part, expected in (("study", key.study), ("page", key.page)):
@@ -281,15 +273,13 @@ def _cell(share: Share) -> str:
 
 
 def study_table(answers: Sequence[Path], key: Path, keep_all: bool = False) -> Report:
-    """The table of a study's answers.
+    """The table of a study's answers. Raise UserError for a key that cannot be read, and if no rater is left, with the first
+    reason.
 
     Args:
         answers: files, or folders of files ``answers*.json``.
         key: the study's key.
         keep_all: whether raters who failed attention checks count.
-
-    Raises:
-        UserError: for a key that cannot be read, and if no rater is left, with the first reason.
     """
     known = read_key(key)
     raters, refused = read_raters(answers, known)
