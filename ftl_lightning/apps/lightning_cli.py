@@ -104,9 +104,8 @@ class CommandLine(LightningCLI):
         return super().instantiate_trainer(**kwargs, callbacks=callbacks)
 
     def before_instantiate_classes(self) -> None:
-        """Claim a log folder that no concurrent run uses: a new folder for an inversion, ``invert``, then ``invert_1`` and so on.
-
-        A pretraining reuses the folder of an earlier run unless that is running. A run from a checkpoint uses the given folder.
+        """Claim a log folder that no concurrent run uses: a new folder for an inversion, ``invert``, then ``invert_1`` and so on. A
+        pretraining reuses the folder of an earlier run unless that is running. A run from a checkpoint uses the given folder.
         """
         if getattr(rank_zero_only, "rank", 0):  # the first process of a run claims the folder
             return

@@ -82,9 +82,8 @@ def concept_map(model: ConceptModel, concepts: Sequence[Concept], seed: int = 0)
 
 
 def check_figure(checks: Sequence[Check]) -> Figure:
-    """Plot demonstrations, their distances and leave-one-out losses; odd or faulty demonstrations are red.
-
-    There is a row for each concept, at most :data:`MOST`.
+    """Plot demonstrations, their distances and leave-one-out losses; odd or faulty demonstrations are red. There is a row for each
+    concept, at most :data:`MOST`.
     """
     shown = checks[:MOST]
     columns = 2 + 2 * any(check.left_out for check in shown)

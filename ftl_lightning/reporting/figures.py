@@ -91,9 +91,8 @@ def _label_bars(axes: Axes, places: Sequence[float], shown: Sequence[str], metri
 
 
 def accuracy_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy") -> Figure:
-    """Plot a metric of every setting beside the paper's numbers and reference lines, for K = 2 or else the most measured K.
-
-    Error bars are standard errors over tasks. ``results`` are rows of a results file.
+    """Plot a metric of every setting beside the paper's numbers and reference lines, for K = 2 or else the most measured K. Error
+    bars are standard errors over tasks. ``results`` are rows of a results file.
     """
     rows = labelled(latest(select(results, domain=domain.name, metric=metric)))
     ours, how = main_rows(rows, main_omega(domain))
@@ -121,9 +120,8 @@ def accuracy_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy
 
 
 def comparison_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy") -> Figure:
-    """Plot a metric of every setting for ours and the baselines, with reference lines and the paper's numbers as diamonds.
-
-    Error bars are standard errors over tasks. ``results`` are rows of a comparison.
+    """Plot a metric of every setting for ours and the baselines, with reference lines and the paper's numbers as diamonds. Error
+    bars are standard errors over tasks. ``results`` are rows of a comparison.
     """
     rows = compared(domain, results)
     names = methods(rows)
@@ -159,9 +157,8 @@ ROW = 0.5  # height of a line of the overview in inches
 
 
 def overview_dots(results: pd.DataFrame) -> Figure:
-    """Plot all domains, settings and metrics of a comparison: a marker for each method, with standard errors over tasks.
-
-    Open diamonds are the paper's numbers of the same method; ticks are reference lines. Our forms are limited to the paper's,
+    """Plot all domains, settings and metrics of a comparison: a marker for each method, with standard errors over tasks. Open
+    diamonds are the paper's numbers of the same method; ticks are reference lines. Our forms are limited to the paper's,
     automatically chosen forms and the default forms of the domains. Rows are those of
     :func:`~ftl_lightning.reporting.comparison.all_methods`.
     """
@@ -262,10 +259,9 @@ def growth(domain: Domain, results: pd.DataFrame) -> Figure:
 
 
 def frontier(domain: Domain, rows: pd.DataFrame) -> Figure:
-    """Plot accuracy over coverage for each suite and setting: a line for each method, temperature from dark to light.
-
-    Points are means over tasks and seeds. Less coverage is better, so better methods lie further up and to the left. Crosses and
-    stars are the reference lines *demonstrations replayed* and *fresh samples*. Rows are those of
+    """Plot accuracy over coverage for each suite and setting: a line for each method, temperature from dark to light. Points are
+    means over tasks and seeds. Less coverage is better, so better methods lie further up and to the left. Crosses and stars are the
+    reference lines *demonstrations replayed* and *fresh samples*. Rows are those of
     :func:`~ftl_lightning.reporting.measurements.read_frontier`.
     """
     rows = rows[rows["domain"] == domain.name].dropna(subset=["accuracy", "coverage"])

@@ -142,9 +142,8 @@ def accuracy_at(rows: pd.DataFrame, coverage: float) -> float | None:
 
 
 def frontier_table(domain: Domain, rows: pd.DataFrame) -> Table:
-    """Accuracy, novelty and coverage of each method at every temperature, from rows of :func:`read_frontier`.
-
-    The last column is its accuracy at the coverage of the paper's form at temperature 1.
+    """Accuracy, novelty and coverage of each method at every temperature, from rows of :func:`read_frontier`. The last column is
+    its accuracy at the coverage of the paper's form at temperature 1.
     """
     lines = []
     rows = rows[rows["domain"] == domain.name].dropna(subset=["coverage"])

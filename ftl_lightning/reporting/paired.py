@@ -40,9 +40,8 @@ def sign_flip(parts: Sequence[float]) -> float:
 
 
 def holm(values: Sequence[float]) -> list[float]:
-    """Corrected p values of several tests, in the given order (Holm, 1979).
-
-    The smallest is multiplied by the number of tests, the next by one less, and so on; corrected values never decrease.
+    """Corrected p values of several tests, in the given order (Holm, 1979). The smallest is multiplied by the number of tests, the
+    next by one less, and so on; corrected values never decrease.
     """
     adjusted, largest = [1.0] * len(values), 0.0
     for rank, index in enumerate(sorted(range(len(values)), key=values.__getitem__)):
@@ -163,9 +162,8 @@ def _parts(differences: pd.Series, tests: int) -> list[float]:
 
 
 def least_certain(compared: Sequence[Lead]) -> Lead | None:
-    """The lead for a single verdict: *ahead* is ahead of every baseline, *behind* is behind at least one.
-
-    Among equal verdicts it is the lead over the best baseline. ``None`` without leads.
+    """The lead for a single verdict: *ahead* is ahead of every baseline, *behind* is behind at least one. Among equal verdicts it
+    is the lead over the best baseline. ``None`` without leads.
     """
     return min(compared, key=lambda lead: ({BEHIND: 0, AHEAD: 2}.get(lead.verdict, 1), lead.difference), default=None)
 

@@ -231,9 +231,8 @@ def lookup(
 
 
 def headlines(domain: Domain, rows: pd.DataFrame) -> list[tuple[str, str]]:
-    """Settings and metrics of short tables: those with numbers of the paper, then the same settings in closed loop.
-
-    Without a paper: the first setting of the suite ``paper``, else all settings, each with its decisive metric.
+    """Settings and metrics of short tables: those with numbers of the paper, then the same settings in closed loop. Without a
+    paper: the first setting of the suite ``paper``, else all settings, each with its decisive metric.
     """
     measured = set(zip(rows["setting"], rows["metric"], strict=True))
     measured_settings = settings(domain, rows)

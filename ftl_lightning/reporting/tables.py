@@ -56,11 +56,7 @@ def _cell(rows: pd.DataFrame) -> str:
 
 
 def _table(
-    domain: Domain,
-    name: str,
-    caption: str,
-    heads: Sequence[str],
-    subjects: Sequence[tuple[Sequence[str], Papers, pd.DataFrame]],
+    domain: Domain, name: str, caption: str, heads: Sequence[str], subjects: Sequence[tuple[Sequence[str], Papers, pd.DataFrame]]
 ) -> Table:
     """A table with a line for each method of each subject: first cells, the paper's numbers, and labelled rows."""
     lines = []
@@ -124,10 +120,8 @@ def main_rows(rows: pd.DataFrame, omega: str) -> tuple[pd.DataFrame, str]:
 
 
 def as_learned_most(domain: Domain, rows: pd.DataFrame) -> pd.DataFrame:
-    """Rows of a single configuration for each method, form and setting, and all reference lines.
-
-    The guidance weight is that of the main tables (:func:`main_rows`). Variant and number of demonstrations are the most measured;
-    ties go to more demonstrations.
+    """Rows of a single configuration for each method, form and setting, and all reference lines. The guidance weight is that of the
+    main tables (:func:`main_rows`). Variant and number of demonstrations are the most measured; ties go to more demonstrations.
     """
     chosen, _ = main_rows(labelled(latest(rows)), main_omega(domain))
     kept = []
@@ -238,9 +232,8 @@ def _paired(domain: Domain, rows: pd.DataFrame) -> Table:
 
 
 def _ablation(domain: Domain, name: str, caption: str, ours: pd.DataFrame, column: str) -> Table:
-    """Ablation of the number of learned concepts (column ``K``) or of the guidance weight (column ``omega``).
-
-    Metrics are the main metric, failures in closed loop, and the paper's metrics. Training settings are left out.
+    """Ablation of the number of learned concepts (column ``K``) or of the guidance weight (column ``omega``). Metrics are the main
+    metric, failures in closed loop, and the paper's metrics. Training settings are left out.
     """
     failures = [metric for metric in metrics(domain) if domain.less_is_better(metric)]
     papers = [number.metric for number in published(domain)]
@@ -278,11 +271,10 @@ def _components(domain: Domain, rows: pd.DataFrame, metric: str) -> Table:
 
 
 def points(domain: Domain, results: pd.DataFrame, axis: str) -> pd.DataFrame:
-    """The rows of a domain's headline, or else its main metric, along an axis of a curve.
-
-    The other column of :data:`AXES` and the guidance weight have the values with most points on the axis. Ties go to the weight of
-    the main tables for demonstrations, and to learned weights for K, as fixed weights per component would increase guidance with
-    K. Settings with the initial states of the demonstrations are left out: they have no more samples than demonstrations.
+    """The rows of a domain's headline, or else its main metric, along an axis of a curve. The other column of :data:`AXES` and the
+    guidance weight have the values with most points on the axis. Ties go to the weight of the main tables for demonstrations, and
+    to learned weights for K, as fixed weights per component would increase guidance with K. Settings with the initial states of the
+    demonstrations are left out: they have no more samples than demonstrations.
     """
     rows = latest(select(results, domain=domain.name, role=METHOD))
     rows = select(rows, metric=decisive(domain, rows))
@@ -310,10 +302,8 @@ def curves_table(domain: Domain, results: pd.DataFrame) -> Table:
 
 
 def changes_table(domain: Domain, results: pd.DataFrame) -> Table:
-    """Ablation of the changes to the paper's form: ours, and ours without a single change at a time.
-
-    There is a line for each variant in the order of the rows, and a column for each setting. The metric is the domain's headline or
-    else its main metric.
+    """Ablation of the changes to the paper's form: ours, and ours without a single change at a time. There is a line for each
+    variant in the order of the rows, and a column for each setting. The metric is the domain's headline or else its main metric.
     """
     rows = latest(select(results, domain=domain.name, role=METHOD))
     metric = decisive(domain, rows)

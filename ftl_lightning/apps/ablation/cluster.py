@@ -71,9 +71,8 @@ def _connect(address: str) -> None:
 
 
 def _here() -> str:
-    """The address of this machine's cluster; empty for none.
-
-    Ray itself trusts the file with the address, and tries for minutes to reach a killed cluster.
+    """The address of this machine's cluster; empty for none. Ray itself trusts the file with the address, and tries for minutes to
+    reach a killed cluster.
     """
     folder = os.environ.get("RAY_TMPDIR") or os.environ.get("TMPDIR") or "/tmp"
     file = Path(folder, "ray", "ray_current_cluster")

@@ -96,9 +96,8 @@ def read_record(results: str | Path) -> dict[str, CellRecord]:
 
 
 def tell(results: str | Path, cells: Sequence[Cell], state: State, node: str = "", note: str = "", seconds: float = 0.0) -> None:
-    """Record a new state of cells, with machine, outcome or error, and duration; other processes are locked out.
-
-    An empty node and 0 seconds keep the known values.
+    """Record a new state of cells, with machine, outcome or error, and duration; other processes are locked out. An empty node and
+    0 seconds keep the known values.
     """
     path = record_path(results)
     with alone(path.parent):
@@ -145,9 +144,8 @@ def by_node(entries: Mapping[str, CellRecord], cells: Sequence[Cell]) -> list[st
 
 
 def seconds_of(cell: Cell, entries: Mapping[str, CellRecord]) -> float | None:
-    """Measured seconds of a cell, or else the mean over similar cells; ``None`` without measurements.
-
-    Similar cells are, in order: the same cell with other seeds; cells of the same configuration files with other options.
+    """Measured seconds of a cell, or else the mean over similar cells; ``None`` without measurements. Similar cells are, in order:
+    the same cell with other seeds; cells of the same configuration files with other options.
     """
     measured = {name: entry for name, entry in entries.items() if entry.seconds}
     if cell.name in measured:

@@ -15,18 +15,7 @@ from typing import TYPE_CHECKING, Literal
 
 from ftl_lightning.apps.ablation.cluster import cluster
 from ftl_lightning.apps.ablation.plan import Cell, Stage
-from ftl_lightning.apps.ablation.record import (
-    Outcome,
-    Run,
-    State,
-    Tell,
-    by_node,
-    count_states,
-    estimate,
-    read_record,
-    table,
-    tell,
-)
+from ftl_lightning.apps.ablation.record import Outcome, Run, State, Tell, by_node, count_states, estimate, read_record, table, tell
 from ftl_lightning.services import log_folder
 from ftl_lightning.services.configuration import load
 from ftl_lightning.services.errors import UserError, require
@@ -41,8 +30,8 @@ if TYPE_CHECKING:
 
 
 def check(cells: Sequence[Cell]) -> None:
-    """Check files, keys and encoder of each cell and, for ``invert``, domain, suites and model. Raise UserError with all mistakes in one
-    line; nothing was started.
+    """Check files, keys and encoder of each cell and, for ``invert``, domain, suites and model. Raise UserError with all mistakes
+    in one line; nothing was started.
     """
     made = {cell.options["model.output"] for cell in cells if cell.verb == "fit" and "model.output" in cell.options}
     mistakes = {}

@@ -120,10 +120,8 @@ def _check_scores(submission: Submission) -> None:
 
 
 def drawn(submission: Submission, share: float, salt: str) -> list[Run]:
-    """Draw the runs to run again, with at least a share of all rows.
-
-    The draw depends on a hash of the file and a word of the checker, ``salt``: who does not know the word cannot tune a file to a
-    favourable draw.
+    """Draw the runs to run again, with at least a share of all rows. The draw depends on a hash of the file and a word of the
+    checker, ``salt``: who does not know the word cannot tune a file to a favourable draw.
     """
     file_hash = submission.hash
     order = sorted(submission.runs, key=lambda run: content_hash([salt, file_hash, run.suite, run.seed]))

@@ -37,10 +37,7 @@ ANSWERS: Mapping[str, Handler] = {
     "sample": (requests.Sample, Workspace.sample),
 }
 """Type of the JSON body and handler of requests that are answered by the handler's result."""
-CHANGES: Mapping[str, Handler] = {
-    "forget": (requests.Named, Workspace.forget),
-    "rename": (requests.Renamed, Workspace.rename),
-}
+CHANGES: Mapping[str, Handler] = {"forget": (requests.Named, Workspace.forget), "rename": (requests.Renamed, Workspace.rename)}
 """The same of requests that are answered by the whole state of the page."""
 
 

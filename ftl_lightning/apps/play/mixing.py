@@ -68,9 +68,8 @@ def starts_of(model: FewShot, tasks: Sequence[str], count: int, seed: int) -> tu
 
 
 def goal_of(domain: Domain, names: Sequence[str], task: str) -> str:
-    """Goal by which a mixture is judged: the joined names if the domain reads them, else the requested task.
-
-    Empty if samples cannot be judged.
+    """Goal by which a mixture is judged: the joined names if the domain reads them, else the requested task. Empty if samples
+    cannot be judged.
     """
     reads = domain.concepts.reads
     return next((text for text in (JOINED.join(names), task) if text and reads(text)), "")

@@ -83,10 +83,8 @@ def _whole(value: Any) -> Any:
 
 
 def pairs_of(concepts: Sequence[dict[str, Any]], named: Sequence[tuple[str, str]] = ()) -> list[tuple[str, str]]:
-    """Pairs of concepts to mix, by their identifiers on the page.
-
-    Without named pairs, learned concepts are mixed with training concepts and with each other; if none are learned, training
-    concepts are mixed.
+    """Pairs of concepts to mix, by their identifiers on the page. Without named pairs, learned concepts are mixed with training
+    concepts and with each other; if none are learned, training concepts are mixed.
     """
     if named:
         by_name = {concept["name"]: concept["id"] for concept in concepts}

@@ -181,12 +181,7 @@ class Place:
     browser: bool = True
 
 
-def serve(
-    routes: Sequence[Route],
-    place: Place,
-    begin: Begin | None = None,
-    close: Callable[[], None] = lambda: None,
-) -> None:
+def serve(routes: Sequence[Route], place: Place, begin: Begin | None = None, close: Callable[[], None] = lambda: None) -> None:
     """Serve a page until Ctrl-C, or until the page ends the program; ``close`` is called at the end. Raise UserError if the address
     is not available.
     """

@@ -170,10 +170,8 @@ def read_raters(paths: Sequence[Path], key: Key) -> tuple[list[Rater], list[str]
 
 
 def inattention(rater: Rater, key: Key) -> str:
-    """Reason to exclude a rater's answers; empty if they count.
-
-    A rater fails by answering any check wrongly, or more than :data:`REPEATS_THAT_MAY_DIFFER` of the repeated questions
-    inconsistently.
+    """Reason to exclude a rater's answers; empty if they count. A rater fails by answering any check wrongly, or more than
+    :data:`REPEATS_THAT_MAY_DIFFER` of the repeated questions inconsistently.
     """
     checks = key.of_kind(CHECK)
     wrong = sum(rater.answers[name] != question.expected for name, question in checks.items())
