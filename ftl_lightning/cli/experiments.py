@@ -124,8 +124,8 @@ def _named(text: str, key: str) -> list[str]:
 
 
 def _chosen(options: BenchmarkOptions) -> list[str]:
-    """The named suites; without names all that the method can run here, with notes on the others. Raise UserError for a named suite
-    that cannot be run here.
+    """The named suites, or all that the method can run here, with notes on the others. Raise UserError if a named one cannot be
+    run.
     """
     from ftl_lightning.apps.benchmark.run import missing_of
     from ftl_lightning.apps.benchmark.suite import load_suite, suite_names

@@ -44,9 +44,7 @@ OTHER_FORMS = "other forms"  # column of our forms other than the paper's
 
 
 def all_methods(comparison: pd.DataFrame, ablations: pd.DataFrame) -> pd.DataFrame:
-    """Rows of all domains with a measured baseline: from the comparison, or from ablations for domains that it lacks. Ablations
-    contribute the most measured configuration of each method.
-    """
+    """Rows of all domains with a measured baseline: of the comparison, or of the most measured configurations in ablations."""
     compared_domains = set(comparison["domain"])
     others = [
         as_learned_most(domain_of(str(name), rows), rows)
@@ -75,8 +73,8 @@ def methods(rows: pd.DataFrame) -> list[Compared]:
 
 
 def comparison_table(domain: Domain, results: pd.DataFrame, shown: Sequence[str] = ()) -> Table:
-    """Table of all methods: paired test, mean with errors, the paper's number and the difference. There is a line for each setting,
-    metric in ``shown`` (if empty, those by which methods are compared), and method.
+    """Table of all methods, with a line for each setting, metric in ``shown`` (by default those of the comparison), and method:
+    paired test, mean with errors, the paper's number and the difference.
     """
     rows = compared(domain, results)
     lines = []

@@ -47,11 +47,7 @@ WIDEST = 60.0  # maximum width of a figure in inches; a figure of thousands of s
 
 
 def colours(named: Iterable[tuple[str, Compared]]) -> dict[str, str]:
-    """Assign a colour to each name: its method's colour, else the colour of another form, else a spare colour.
-
-    Args:
-        named: names in a figure with their methods; user methods have spare colours.
-    """
+    """Assign a colour to each name of a method: its method's colour, else the colour of another form, else a spare colour."""
     chosen: dict[str, str] = {}
     waiting: dict[str, Compared] = {}
     for name, method in named:

@@ -38,14 +38,8 @@ COLUMNS = [*SUBJECT, *_MEASURES]
 
 
 def _read(path: str | Path, name: str, key: str, kind: Callable[..., T], expected: str) -> list[T]:
-    """Read the rows of a file; empty if there is no file. Raise UserError for an invalid file, naming file and row.
-
-    Args:
-        path: the file, or its folder.
-        name: name of the file in a folder.
-        key: key of the rows.
-        kind: dataclass of a row; ``null`` counts as missing.
-        expected: expected content, for messages.
+    """Rows of a file, or of the file ``name`` in a folder, under ``key``; empty if there is none, and ``null`` counts as missing.
+    Raise UserError for a file without the expected content, naming file and row.
     """
     path = Path(path)
     path = path / name if path.is_dir() else path
@@ -68,13 +62,8 @@ def _without_null(row: object) -> object:
 
 @dataclass(frozen=True)
 class Measured:
-    """A point of a curve.
-
-    Attributes:
-        curve: name of the curve, such as :data:`PUBLISHED`.
-        steps: gradient steps; mean over concepts if each stops by itself.
-        seconds: learning time.
-        accuracy: mean over concepts of the share of plans that show the concept.
+    """A point of a curve: gradient steps (mean over concepts), seconds of learning, and the share of right plans (mean over
+    concepts).
     """
 
     curve: str
@@ -142,9 +131,7 @@ def accuracy_at(rows: pd.DataFrame, coverage: float) -> float | None:
 
 
 def frontier_table(domain: Domain, rows: pd.DataFrame) -> Table:
-    """Accuracy, novelty and coverage of each method at every temperature, from rows of :func:`read_frontier`. The last column is
-    its accuracy at the coverage of the paper's form at temperature 1.
-    """
+    """Accuracy, novelty and coverage of each method at every temperature, and accuracy at the coverage of the paper's form at 1."""
     lines = []
     rows = rows[rows["domain"] == domain.name].dropna(subset=["coverage"])
     for (suite, setting), setting_rows in rows.groupby(["suite", "setting"], sort=False):

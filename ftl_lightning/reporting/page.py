@@ -36,14 +36,8 @@ MOST = 15_000_000  # page size in bytes above which a note is printed
 
 
 def write_page(results: Path, path: Path) -> int:
-    """Write the page. Raise UserError if there are no results, or a file of films is invalid.
-
-    Args:
-        results: folder of results, with films and learned concepts in :data:`FILMS` and :data:`CONCEPTS`.
-        path: the HTML file.
-
-    Returns:
-        Its size in bytes.
+    """Write the page of a folder of results, with :data:`FILMS` and :data:`CONCEPTS`, and return its bytes' number. Raise UserError
+    if there are no results, or a file of films is invalid.
     """
     rows = read_rows(results)
     compared_rows = all_methods(read_study(results, COMPARISON), read_study(results))

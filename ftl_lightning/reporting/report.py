@@ -35,16 +35,14 @@ MOST_DOMAINS, MOST_CELLS = 100, 10_000  #: Maximum number of domains of a report
 
 
 def write_report(results: Path, out: Path, readme: Path | None = None) -> str:
-    """Write Markdown, LaTeX and figures. Raise UserError if there are no results, or the Markdown file has no marks.
+    """Write Markdown, LaTeX and figures, and return all tables as Markdown. Raise UserError if there are no results, or the
+    Markdown file has no marks.
 
     Args:
         results: a results file, or a folder of them.
-        out: output folder, with a subfolder for each domain.
+        out: output folder, with a subfolder for each domain and the complete overview.
         readme: a Markdown file whose part between two marks is replaced by the short overview of the comparison, or without a
-            comparison by each domain's main table. The complete overview is ``overview.md`` in ``out``.
-
-    Returns:
-        All tables as Markdown.
+            comparison by each domain's main table.
     """
     rows = read_rows(results)
     ablations, comparison, curves, changes = (read_study(results, name) for name in ("", COMPARISON, CURVES, CHANGES))

@@ -91,15 +91,8 @@ def _weightings(rows: pd.DataFrame) -> list[tuple[int, str]]:
 
 
 def main_rows(rows: pd.DataFrame, omega: str) -> tuple[pd.DataFrame, str]:
-    """Rows of a main table: for each method and setting two components with the main weight, or else the most measured weighting.
-
-    Args:
-        rows: rows with labels, see :func:`labelled`.
-        omega: guidance weight of the main tables.
-
-    Returns:
-        The rows, with the weighting of ours in the column ``mark`` where it differs from the caption's; and the caption's words
-        for the weighting.
+    """Rows of a main table, and the words of its caption: for each method and setting two components with the main weight
+    ``omega``, or else the most measured weighting, which the column ``mark`` then names. Rows have labels, see :func:`labelled`.
     """
     rows = select(rows, role=METHOD)
     usual = (USUAL_K, omega)
@@ -194,8 +187,8 @@ def _outcomes(domain: Domain, rows: pd.DataFrame) -> list[Table]:
 
 
 def against(ours: pd.DataFrame, policy: str) -> tuple[int, int, int] | None:
-    """Episodes that only ours wins, episodes that only the policy wins from the same start, and all; ``None`` without rows. Raise
-    UserError for counts that are impossible.
+    """Episodes that only ours wins, that only the policy wins from the same start, and all, or ``None``. Raise UserError for
+    impossible counts.
     """
     won, lost = (select(ours, metric=f"{begin}{policy}") for begin in (WON, LOST))
     if won.empty:
@@ -232,9 +225,7 @@ def _paired(domain: Domain, rows: pd.DataFrame) -> Table:
 
 
 def _ablation(domain: Domain, name: str, caption: str, ours: pd.DataFrame, column: str) -> Table:
-    """Ablation of the number of learned concepts (column ``K``) or of the guidance weight (column ``omega``). Metrics are the main
-    metric, failures in closed loop, and the paper's metrics. Training settings are left out.
-    """
+    """Ablation of the number of learned concepts (``column`` K) or of the guidance weight (omega), without training settings."""
     failures = [metric for metric in metrics(domain) if domain.less_is_better(metric)]
     papers = [number.metric for number in published(domain)]
     shown = [metric for metric in dict.fromkeys((domain.main_metric, *failures, *papers)) if metric in set(ours["metric"])]
@@ -302,8 +293,8 @@ def curves_table(domain: Domain, results: pd.DataFrame) -> Table:
 
 
 def changes_table(domain: Domain, results: pd.DataFrame) -> Table:
-    """Ablation of the changes to the paper's form: ours, and ours without a single change at a time. There is a line for each
-    variant in the order of the rows, and a column for each setting. The metric is the domain's headline or else its main metric.
+    """Ablation of the changes to the paper's form: a line for ours, and for ours without a single change, by setting; decisive
+    metric.
     """
     rows = latest(select(results, domain=domain.name, role=METHOD))
     metric = decisive(domain, rows)

@@ -31,10 +31,9 @@ def cluster(address: str, attempt: Attempt, cells: Sequence[Cell] = ()) -> Itera
     is missing, no cluster answers, or a cell fits on no machine.
 
     Args:
-        address: ``'HOST:PORT'`` of the head; ``'auto'`` for the cluster of this machine; ``'local'`` for the processors of this
-            machine; empty for Ray's order: ``RAY_ADDRESS``, else a cluster on this machine, else its processors.
-        attempt: runs a cell on a machine of the cluster, in the current folder.
-        cells: cells to run.
+        address: ``'HOST:PORT'`` of the head; ``'auto'`` for this machine's cluster; ``'local'`` for its processors; empty for Ray's
+            order: ``RAY_ADDRESS``, else a cluster on this machine, else its processors.
+        attempt, cells: runs a cell on a machine of the cluster, in the current folder; and the cells to run.
     """
     try:
         import ray
@@ -71,9 +70,7 @@ def _connect(address: str) -> None:
 
 
 def _here() -> str:
-    """The address of this machine's cluster; empty for none. Ray itself trusts the file with the address, and tries for minutes to
-    reach a killed cluster.
-    """
+    """The address of this machine's cluster, or empty; Ray trusts the file, and tries for minutes to reach a killed cluster."""
     folder = os.environ.get("RAY_TMPDIR") or os.environ.get("TMPDIR") or "/tmp"
     file = Path(folder, "ray", "ray_current_cluster")
     try:

@@ -22,8 +22,7 @@ class Resources:
     """Resources of a cell.
 
     Attributes:
-        cpus: number of processors; whole, or a fraction below 1.
-        gpus: number of GPUs; likewise.
+        cpus, gpus: number of processors and of GPUs; whole, or a fraction below 1.
         memory_gb: gigabytes of 10^9 bytes; 0 for no request. Slurm enforces the limit, Ray does not.
         custom: custom resources of a Ray cluster by name, such as ``{'big': 1}`` of nodes started with it.
     """
@@ -55,11 +54,7 @@ class Resources:
         return options | ({"resources": dict(self.custom)} if self.custom else {})
 
     def fit(self, node: Mapping[str, float]) -> bool:
-        """Whether an idle node of a Ray cluster has these resources.
-
-        Args:
-            node: its resources, in Ray's names (memory in bytes).
-        """
+        """Whether an idle ``node``, given by its resources in Ray's names (memory in bytes), has these resources."""
         needs = {"CPU": self.cpus, "GPU": self.gpus, "memory": self.memory_gb * GIGABYTE, **self.custom}
         return all(node.get(name, 0) >= amount for name, amount in needs.items())
 
@@ -108,13 +103,13 @@ class Stage:
         config: configuration file, or several files to merge in order.
         name: part of the cells' names, for stages that differ only in their options.
         each: lists of texts by name, for placeholders in other values; the stage runs for their product.
-        options: options of all cells, by their names on the command line.
-        grid: lists of values by option; the cells are their product.
-        done: file whose presence means that the stage need not run, such as a pretrained model; empty for none. Its content is
-            not checked: remove it after a change of the stage's configuration.
+        options, grid: options of all cells by their names on the command line, and lists of values, of whose product each cell has
+            one.
+        done: file whose presence means that the stage need not run; empty for none. Its content is not checked: remove it after a
+            change of the stage's configuration.
         seeds: subset of the ablation's seeds; empty for all.
-        resources: resources of each cell on a cluster: ``cpus`` (default 1), ``gpus``, ``memory_gb``, and any resource with which
-            the nodes of a Ray cluster were started.
+        resources: resources of each cell on a cluster: ``cpus`` (default 1), ``gpus``, ``memory_gb``, and custom resources of Ray's
+            nodes.
     """
 
     verb: Literal["fit", "invert"]

@@ -82,16 +82,14 @@ def _check(cell: Cell, made: set[str]) -> None:
 def run_ablation(
     plan: Sequence[Sequence[Cell]], results: str, executor: Literal["local", "ray"] = "local", address: str = ""
 ) -> None:
-    """Run all cells, stage after stage. A failed cell does not stop the others; failures are listed at the end.
-
-    The state of each cell is recorded beside the results, see :mod:`~ftl_lightning.apps.ablation.record`. Raise UserError before
-    the first run, for cells that cannot run; at the end, naming failed cells.
+    """Run all cells, stage after stage, and record their states beside the results. A failed cell does not stop the others. Raise
+    UserError before the first run, for cells that cannot run; at the end, naming failed cells.
 
     Args:
         plan: cells of each stage, in order; a stage may read files of earlier stages.
         results: results file.
-        executor: ``'local'`` runs cells one by one in this process; ``'ray'`` runs cells in parallel on a cluster whose machines
-            share this folder. A cell that loses its process or machine runs once more.
+        executor: ``'local'`` runs cells one by one in this process; ``'ray'`` in parallel on a cluster whose machines share this
+            folder. A cell that loses its process or machine runs once more.
         address: address of the Ray cluster, see :func:`~ftl_lightning.apps.ablation.cluster.cluster`.
     """
     from ftl_lightning.evaluation.results import add_rows
@@ -136,13 +134,8 @@ def run_ablation(
 
 
 def planned(stages: Sequence[Stage], seeds: Sequence[int], root: str = "", only: Sequence[int] = ()) -> dict[int, list[Cell]]:
-    """The cells of each stage by its number, from 1, for all seeds.
-
-    Args:
-        stages: stages in order.
-        seeds: each stage runs once per seed.
-        root: ``data.root`` of every cell; empty for the value of the configurations.
-        only: numbers of the stages; empty for all.
+    """The cells of each stage by its number, from 1, for all seeds. ``root`` is ``data.root`` of every cell (empty: as configured);
+    ``only`` selects stages by number (empty: all). Raise UserError without seeds, or for an unknown number.
     """
     require(seeds, "seeds", "one or more", "none")
     for number in only:
@@ -215,12 +208,8 @@ def _one_after_another(cells: Sequence[Cell], known: set[str], tell: Tell) -> It
 
 
 def attempt(cell: Cell, known: set[str], again: bool = False) -> Outcome:
-    """Run a cell, unless its results are known; any error becomes its outcome.
-
-    Args:
-        cell: the cell.
-        known: configuration hashes that need not run.
-        again: whether the cell was lost before; pretraining then resumes from its last checkpoint, if any.
+    """Run a cell, unless its configuration hash is known; any error becomes its outcome. Pretraining that was lost before
+    (``again``) resumes from its last checkpoint, if any.
     """
     if _is_made(cell):
         return Outcome(note="done before")

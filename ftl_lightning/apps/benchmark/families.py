@@ -95,12 +95,7 @@ def beats(kind: str, count: int, seed: int) -> NDArray[np.float32]:
 
 @dataclass(frozen=True)
 class Nearest:
-    """Classify samples by the nearest template; columns are scaled by their spread.
-
-    Attributes:
-        draw: draws templates.
-        kinds: known kinds.
-    """
+    """Classify samples by the nearest template of known kinds; columns are scaled by their spread."""
 
     draw: Draw
     kinds: tuple[str, ...]

@@ -167,8 +167,7 @@ def strokes(kind: str, count: int, seed: int) -> NDArray[np.float32]:
 
     Args:
         kind: one of :data:`TRAINING` or :data:`NEW`.
-        count: number of strokes.
-        seed: random seed; strokes are equal on every machine up to rounding.
+        count, seed: number of strokes, and random seed; strokes are equal on every machine up to rounding.
 
     Returns:
         ``(count, 40, 2)``, x and y, in centimetres, mostly within 4 of the origin.
@@ -202,18 +201,13 @@ def _scribbles(even: Points, rng: np.random.Generator) -> Points:
 
 
 def drawn(kind: str, count: int, seed: int, alike: float = 0.0) -> NDArray[np.float32]:
-    """Hand-drawn strokes of one kind.
+    """Hand-drawn strokes of one kind, as of :func:`strokes`: ``(count, 40, 2)``.
 
     Args:
         kind: one of :data:`KNOWN`, :data:`VALIDATION` or :data:`TEST`, also after :data:`MIRRORED` or :data:`BACKWARDS`; or
             :data:`RANDOM`.
-        count: number of strokes.
-        seed: random seed; strokes are equal on every machine up to rounding.
         alike: 0 for strokes of many people, all over the canvas; up to 1 for one person's strokes at the same place, which differ
             in bending and trembling.
-
-    Returns:
-        ``(count, 40, 2)``, x and y, in centimetres, mostly within 4 of the origin.
     """
     rng = np.random.default_rng([seed, task_key(kind)])
     plain = kind.removeprefix(MIRRORED).removeprefix(BACKWARDS)
@@ -262,12 +256,7 @@ def _normalised(points: NDArray[np.float32]) -> Points:
 
 @dataclass(frozen=True)
 class Judge:
-    """Classifier of strokes by the nearest template, invariant to place and size.
-
-    Attributes:
-        kinds: known kinds.
-        templates: normalised ``(kind * template, 80)``.
-    """
+    """Classifier of strokes by the nearest of normalised templates ``(kind * template, 80)``, invariant to place and size."""
 
     kinds: tuple[str, ...]
     templates: Points

@@ -45,8 +45,8 @@ class Desk:
     """Workspaces of the opened models. Requests are handled in the current workspace, one at a time.
 
     Args:
-        models: names of models that can be opened; the first is the initial model.
-        make: creates the workspace of a model; called in a thread.
+        models, make: names of models that can be opened, the initial model first; and creates the workspace of a model, in a
+            thread.
     """
 
     def __init__(self, models: Sequence[str], make: Callable[[str], Workspace]) -> None:
@@ -73,7 +73,7 @@ class Desk:
         return self._opened[model]
 
     def open(self, model: str) -> dict[str, Any]:
-        """Switch to another model; the workspace of the previous model is kept. Raise UserError for a model that cannot be opened."""
+        """Switch to another model, and keep the workspace of the previous. Raise UserError for a model that cannot be opened."""
         require(model in self._models, "model", f"one of {', '.join(self._models)}", short(model))
         workspace = self._workspace(model)
         self._current = model

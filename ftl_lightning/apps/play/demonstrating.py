@@ -22,14 +22,8 @@ FILES = (".npz", ".safetensors")  # suffixes of demonstration files, besides tho
 
 
 class Demonstrating:
-    """Demonstrations of a concept, and the scenes in which more can be recorded.
-
-    Args:
-        model: model of the same domain.
-        source: library; files of recordings may be missing.
-
-    Attributes:
-        task: task of the last scene or demonstration drawn; empty for none.
+    """Demonstrations of a concept for a model, and the scenes in which more can be recorded. ``source`` is the library, whose
+    recordings may be missing; ``task`` that of the last scene or demonstration drawn, or empty.
     """
 
     def __init__(self, model: FewShot, source: Source) -> None:
@@ -93,9 +87,7 @@ class Demonstrating:
         return recorder
 
     def scene(self, request: requests.Pose) -> Json:
-        """Draw a new scene for a demonstration. Raise UserError in a domain without recording by hand, or for a task without
-        scenes.
-        """
+        """Draw a new scene. Raise UserError in a domain without recording by hand, or for a task without scenes."""
         recorder = self._recorder()
         expected = f"one of {len(recorder.tasks)} whose scenes can be drawn"
         require(not request.task or request.task in recorder.tasks, "task", expected, short(request.task))

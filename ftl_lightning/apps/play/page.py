@@ -43,12 +43,9 @@ HEADER = 16 * 2**20  # maximum bytes read to determine the kind of a file
 
 
 def page(nonce: str, offline: bytes | None = None) -> str:
-    """The page as HTML.
-
-    Args:
-        nonce: nonce of style and scripts; letters and digits. The server sends a content security policy with the page.
-        offline: gzip of a JSON object of answers by :func:`request_key`, for a page without a server: ``/api/state``, thumbnails
-            and samples. Such a page contains its :data:`POLICY`.
+    """The page as HTML. The server sends a content security policy with the page for style and scripts with the ``nonce``. A page
+    without a server contains its :data:`POLICY`, and gzip of JSON answers by :func:`request_key`: ``/api/state``, thumbnails,
+    samples.
     """
     meta = f'<meta http-equiv="Content-Security-Policy" content="{POLICY.format(nonce=nonce)}">\n'
     parts = {
@@ -63,11 +60,8 @@ def page(nonce: str, offline: bytes | None = None) -> str:
 
 
 def request_key(path: str, body: Any = None) -> str:
-    """Key of a request among precomputed answers, as the page computes it.
-
-    Args:
-        path: such as ``/api/thumbnail?id=c1``.
-        body: body of a POST; keys in the page's order. Whole numbers are written without a point, as in JavaScript.
+    """Key of a request among precomputed answers, as the page computes it: path and query, then the body of a POST with keys in the
+    page's order and whole numbers without a point, as in JavaScript.
     """
     if body is None:
         return path
@@ -83,8 +77,8 @@ def _whole(value: Any) -> Any:
 
 
 def pairs_of(concepts: Sequence[dict[str, Any]], named: Sequence[tuple[str, str]] = ()) -> list[tuple[str, str]]:
-    """Pairs of concepts to mix, by their identifiers on the page. Without named pairs, learned concepts are mixed with training
-    concepts and with each other; if none are learned, training concepts are mixed.
+    """Pairs of concepts to mix, by identifier. By default, learned concepts are mixed with training concepts and each other, or
+    training concepts alone.
     """
     if named:
         by_name = {concept["name"]: concept["id"] for concept in concepts}
@@ -149,11 +143,8 @@ def results_page(file: str) -> str:
 
 
 def viewed(file: str, model: str = "") -> dict[str, Any]:
-    """State of the page for a file. Raise UserError naming the file, if it is none of these.
-
-    Args:
-        file: demonstrations, samples or a learned concept; the name or folder of a data set.
-        model: model of a learned concept; empty to search for it.
+    """State of the page for demonstrations, samples, or a concept with its ``model`` (empty to search). Raise UserError for other
+    files.
     """
     path = Path(file)
     if path.suffix == ".safetensors":

@@ -118,14 +118,8 @@ async def body_of(request: Request, most: int) -> bytes:
 def guarded(
     routes: Sequence[Route], token: str, hosts: Sequence[str], end: Callable[[], None], begin: Begin | None = None
 ) -> Starlette:
-    """Application that answers requests of a single page.
-
-    Args:
-        routes: routes besides the end of the program.
-        token: required in requests.
-        hosts: ``host:port`` that requests may name.
-        end: ends the program.
-        begin: called at the start; ``None`` for nothing.
+    """Application of a single page: answer requests that name the token and one of the ``hosts`` (``host:port``), by ``routes`` or
+    by ``end``, which ends the program. ``begin`` is called at the start.
     """
 
     async def ended(request: Request) -> Response:
@@ -168,12 +162,8 @@ async def _mistaken(request: Request, error: Exception) -> Response:
 
 @dataclass(frozen=True)
 class Place:
-    """Address of a page.
-
-    Attributes:
-        host: address to listen on; any but the loopback address admits other machines, with a warning.
-        port: port number; 0 for :data:`PORT`, or any free port if that is in use.
-        browser: whether to open a browser.
+    """Address of a page; any host but the loopback admits other machines, with a warning. Port 0 is :data:`PORT`, or any if that is
+    in use.
     """
 
     host: str = LOOPBACK
@@ -182,9 +172,7 @@ class Place:
 
 
 def serve(routes: Sequence[Route], place: Place, begin: Begin | None = None, close: Callable[[], None] = lambda: None) -> None:
-    """Serve a page until Ctrl-C, or until the page ends the program; ``close`` is called at the end. Raise UserError if the address
-    is not available.
-    """
+    """Serve a page until Ctrl-C or its end, then call ``close``. Raise UserError if the address is not available."""
     listening = _listening(place.host, place.port)
     port, names, token = listening.getsockname()[1], _names(place.host), secrets.token_urlsafe(24)
     hosts = [f"{name}:{port}" for name in names]
@@ -212,12 +200,7 @@ def serve(routes: Sequence[Route], place: Place, begin: Begin | None = None, clo
 
 
 class _Server(uvicorn.Server):
-    """Server that stops running work before it waits for the last answers.
-
-    Args:
-        config: settings of the server.
-        close: called first when the program ends.
-    """
+    """Server that stops running work, by ``close``, before it waits for the last answers."""
 
     def __init__(self, config: uvicorn.Config, close: Callable[[], None]) -> None:
         super().__init__(config)

@@ -47,13 +47,10 @@ class Known:
     """Concept that can be mixed.
 
     Attributes:
-        name: text of the concept.
-        kind: ``'training'``; ``'shipped'`` or ``'saved'`` in the model's library; ``'opened'`` from a file; ``'learned'`` here.
-        composition: composition to sample from.
-        concept: content of the concept's file; ``None`` for a training concept.
-        file: path or name of the concept's file; empty for training concepts and those learned here.
-        learned: how the concept was learned here; else ``None``.
-        demonstrations: training data of a concept learned here; else ``None``.
+        name, kind: text, and ``'training'``; ``'shipped'`` or ``'saved'`` in the model's library; ``'opened'`` from a file;
+            ``'learned'`` here.
+        concept, file: content, and path or name of the concept's file; none for training concepts, no path for those learned here.
+        learned, demonstrations: how the concept was learned here, and from what; else ``None``.
         accuracy: fraction of correct samples; ``None`` if not judged.
     """
 
@@ -77,11 +74,8 @@ class Known:
 
 
 class Workspace:
-    """Model and the state of its session. No files are written: the browser saves them.
-
-    Args:
-        model: name of a shipped model, or a folder.
-        root: folder of the user's copy of recordings, for domains whose demonstrations do not ship.
+    """Model, by name or folder, and the state of its session. No files are written: the browser saves them. ``root`` is the user's
+    copy of recordings, for domains whose demonstrations do not ship.
     """
 
     def __init__(self, model: str, root: Path | None = None) -> None:
@@ -161,9 +155,7 @@ class Workspace:
         return self.work()
 
     def upload(self, name: str, content: bytes) -> None:
-        """Read a file of demonstrations, of a concept, or of another program. Raise UserError for another kind of file, or a file
-        of another model or domain.
-        """
+        """Read demonstrations, a concept, or another program's file. Raise UserError for others, or another model or domain."""
         ending, endings = Path(name).suffix.lower(), self._demonstrating.files
         require(ending in endings, "file", f"a name that ends in {' or '.join(endings)}", repr(short(name)))
         if ending == ".safetensors" and kind_of(content) == KIND:
@@ -172,9 +164,7 @@ class Workspace:
             self._demonstrating.read(name, content)
 
     def demonstrations_file(self, key: str) -> tuple[str, bytes]:
-        """Name and bytes of an ``.npz`` of the current demonstrations, or of those of a concept learned here. Raise UserError if
-        there are none.
-        """
+        """Name and bytes of an ``.npz`` of the current demonstrations, or of a concept's. Raise UserError if there are none."""
         if not key:
             return "demonstrations.npz", as_npz(self._demonstrating.together(""))
         known = self._known(key)
@@ -236,11 +226,8 @@ class Workspace:
         self._concepts[request.id] = replace(known, name=name, concept=concept, learned=learned)
 
     def learn(self, request: requests.Learn, tell: Tell, stopped: Callable[[], bool]) -> None:
-        """Learn a concept from the demonstrations, and report loss and samples meanwhile by ``tell``.
-
-        Raises:
-            UserError: without demonstrations, or if they cannot be learned from.
-            Stopped: if no client waits.
+        """Learn a concept from the demonstrations, and report loss and samples meanwhile by ``tell``. Raise UserError if there are
+        none or they cannot be learned from, and Stopped if no client waits.
         """
         name = " ".join(request.name.split())
         demonstrations, begin = self._demonstrating.together(name), monotonic()

@@ -51,11 +51,9 @@ def make_study(domain: Domain, questions: Questions, out: Path, title: str = "",
     another study.
 
     Args:
-        domain: domain of the films.
-        questions: questions about the films.
+        domain, questions: domain of the films, and questions about them.
         out: folder to write to.
-        title: title of the page; empty for a neutral title.
-        consent: consent of raters; empty for :data:`CONSENT`.
+        title, consent: title of the page, and consent of raters; empty for a neutral title and :data:`CONSENT`.
     """
     minutes = max(1, round(len(questions.page) * SECONDS_A_QUESTION / 60))
     content: dict[str, Any] = {
