@@ -36,9 +36,9 @@ class CommandLine(LightningCLI):
 
     trainer: Trainer
 
-    def __init__(self, verb: str, *classes: type, **options: Any) -> None:
+    def __init__(self, verb: str, model: type, data: type, **options: Any) -> None:
         self._verb = verb
-        super().__init__(*classes, **options)
+        super().__init__(model, data, **options)
 
     def subcommands(self) -> dict[str, set[str]]:  # type: ignore[override]
         """The requested verb and its non-option arguments; parsers of all verbs would take a third of the start-up time."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from ftl_lightning.apps.ablation import Stage
+from ftl_lightning.apps.ablation.plan import Stage
 from ftl_lightning.services.errors import UserError, require, short
 from ftl_lightning.services.text import line, say
 from ftl_lightning.services.validation import check_count

@@ -50,14 +50,11 @@ def _read(path: str | Path, name: str, key: str, kind: Callable[..., T], expecte
         rows = content.get(key) if isinstance(content, dict) else None
         if not isinstance(rows, list):
             raise UserError(f"key {key!r}: expected a list, found {shown(rows)}")
-        return [from_mapping(kind, _without_null(row), f"{key}[{number}]") for number, row in enumerate(rows)]
+        known = [{name: row[name] for name in row if row[name] is not None} if isinstance(row, dict) else row for row in rows]
+        return [from_mapping(kind, row, f"{key}[{number}]") for number, row in enumerate(known)]
     except UserError as error:
         reason = str(error).removeprefix(f"{path}: ")
         raise UserError(f"{path}: expected {expected}, found something else ({reason})") from error
-
-
-def _without_null(row: object) -> object:
-    return {name: value for name, value in row.items() if value is not None} if isinstance(row, dict) else row
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ import os
 import socket
 import tempfile
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -116,9 +116,9 @@ def _run(attempt: Attempt, cells: Sequence[Cell], known: set[str], tell: Tell) -
 
         def send(cell: Cell, runs: int) -> None:
             begun = Path(folder, str(next(numbers)))
-            task = remote.options(name=cell.folder, **cell.resources.ray())
-            sent = task.remote(str(Path.cwd()), cell, known, trust.vouched(), attempt, str(begun), runs > 1)
-            waiting[sent] = _Sent(cell, runs, begun)
+            remote_cell = remote.options(name=cell.folder, **cell.resources.ray())
+            task = remote_cell.remote(str(Path.cwd()), cell, known, trust.vouched(), attempt, str(begun), runs > 1)
+            waiting[task] = _Sent(cell, runs, begun)
 
         numbers = itertools.count()
         for cell in cells:
@@ -127,7 +127,10 @@ def _run(attempt: Attempt, cells: Sequence[Cell], known: set[str], tell: Tell) -
         while waiting:
             ready, _ = ray.wait(list(waiting), num_returns=1, timeout=POLL)
             now = time.monotonic()
-            _tell_begun(waiting.values(), tell)
+            for sent in waiting.values():
+                if not sent.node and sent.begun.is_file():
+                    sent.node = sent.begun.read_text("utf-8") or "?"
+                    tell(sent.cell, "running", sent.node, "")
             for task in ready:
                 ended = waiting.pop(task)
                 outcome, lost = _outcome(task)
@@ -170,13 +173,6 @@ def _nodes() -> list[dict[str, Any]]:
     return [node["Resources"] for node in ray.nodes() if node["Alive"]]
 
 
-def _tell_begun(waiting: Iterable[_Sent], tell: Tell) -> None:
-    for sent in waiting:
-        if not sent.node and sent.begun.is_file():
-            sent.node = sent.begun.read_text("utf-8") or "?"
-            tell(sent.cell, "running", sent.node, "")
-
-
 def _outcome(task: Any) -> tuple[Outcome, bool]:
     """Outcome of a cell, and whether its process or machine was lost."""
     import ray
@@ -209,7 +205,9 @@ def _attempt_in(
     folder: str, cell: Cell, known: set[str], vouched: frozenset[str], attempt: Attempt, begun: str, again: bool
 ) -> Outcome:
     """Run a cell in the shared folder of a cluster, with the modules that the user vouches for."""
-    node = _node_name()
+    import ray
+
+    node = f"{socket.gethostname()}/{ray.get_runtime_context().get_node_id()[:6]}"  # a machine may run several nodes
     if not Path(begun).parent.is_dir():
         message = f"{folder}: expected a folder that all machines share, found that {node} does not have it; call ablate in one"
         return Outcome(error=message, node=node)
@@ -218,10 +216,3 @@ def _attempt_in(
     write_text(begun, node)
     with trust.vouching(vouched):
         return replace(attempt(cell, known, again), node=node)
-
-
-def _node_name() -> str:
-    """Host name and the first letters of the node id, since a machine may run several nodes."""
-    import ray
-
-    return f"{socket.gethostname()}/{ray.get_runtime_context().get_node_id()[:6]}"

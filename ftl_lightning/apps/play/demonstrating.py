@@ -143,12 +143,12 @@ class Demonstrating:
         require(request.id in self._entries, "id", "an existing demonstration", request.id)
         self._change({number: entry for number, entry in self._entries.items() if number != request.id})
 
-    def undo(self) -> None:
+    def undo(self, request: requests.Nothing) -> None:
         """Undo the last change."""
         if self._before:
             self._entries = self._before.pop()
 
-    def clear(self) -> None:
+    def clear(self, request: requests.Nothing) -> None:
         """Remove all demonstrations."""
         if self._entries:
             self._change({})

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import monotonic
-from typing import Any
+from typing import Any, TypeVar
 
 from ftl_lightning.apps.play import requests
 from ftl_lightning.apps.play.demonstrating import Demonstrating, as_npz
@@ -31,6 +31,7 @@ QUICK: Mapping[str, Any] = {"form": PAPER, "samples": 16, "learning_rate": 0.3}
 QUICK_STEPS = 250  # steps of quick learning from a user's data; chosen on strokes, see docs/experiments-own-data.md
 
 Tell = Callable[[Json], None]
+R = TypeVar("R")
 
 
 def title_of(model: str) -> str:
@@ -71,6 +72,16 @@ class Known:
             content["count"] = concept.origin.count
             content["form"] = concept.choice.form if concept.choice else "modes" if concept.modes else "one set"
         return content
+
+
+def _changing(change: Callable[[Demonstrating, R], None]) -> Callable[["Workspace", R], Json]:
+    """Method that changes the demonstrations and returns the new work."""
+
+    def method(workspace: "Workspace", request: R) -> Json:
+        change(workspace._demonstrating, request)
+        return workspace.work()
+
+    return method
 
 
 class Workspace:
@@ -123,36 +134,12 @@ class Workspace:
         """Suggested name of the concept: the name of the demonstrations, if a file or the library gave it."""
         return self._demonstrating.name or "new concept"
 
-    # Demonstrations: each change returns the new work.
-
     def scene(self, request: requests.Pose) -> Json:
         """Draw a new scene for a demonstration."""
         return self._demonstrating.scene(request)
 
-    def record(self, request: requests.Recorded) -> Json:
-        """Add a demonstration recorded by hand."""
-        self._demonstrating.record(request)
-        return self.work()
-
-    def draw(self, request: requests.Drawn) -> Json:
-        """Add demonstrations of the library."""
-        self._demonstrating.draw(request)
-        return self.work()
-
-    def remove(self, request: requests.One) -> Json:
-        """Remove a demonstration."""
-        self._demonstrating.remove(request)
-        return self.work()
-
-    def undo(self, request: requests.Nothing) -> Json:
-        """Undo the last change."""
-        self._demonstrating.undo()
-        return self.work()
-
-    def clear(self, request: requests.Nothing) -> Json:
-        """Remove all demonstrations."""
-        self._demonstrating.clear()
-        return self.work()
+    record, draw = _changing(Demonstrating.record), _changing(Demonstrating.draw)
+    remove, undo, clear = _changing(Demonstrating.remove), _changing(Demonstrating.undo), _changing(Demonstrating.clear)
 
     def upload(self, name: str, content: bytes) -> None:
         """Read demonstrations, a concept, or another program's file. Raise UserError for others, or another model or domain."""
