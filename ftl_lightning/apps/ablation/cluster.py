@@ -43,7 +43,10 @@ def cluster(address: str, attempt: Attempt, cells: Sequence[Cell] = ()) -> Itera
     if started:
         _connect(address or os.environ.get("RAY_ADDRESS", ""))
     try:
-        _check_room(cells)
+        nodes = _nodes()
+        for cell in cells:
+            fits, expected = any(map(cell.resources.fit, nodes)), f"a machine with {cell.resources} in the cluster"
+            require(fits, f"resources: {cell}", expected, f"none among {len(nodes)}; lower them or add a machine")
         yield partial(_run, attempt)
     finally:
         if started:
@@ -152,18 +155,6 @@ def _run(attempt: Attempt, cells: Sequence[Cell], known: set[str], tell: Tell) -
                     f"address: the head of the cluster at {address} no longer answers; start it again, and give the same command: "
                     "cells that are done stay done"
                 )
-
-
-def _check_room(cells: Sequence[Cell]) -> None:
-    """Refuse cells that fit on no machine of the cluster and would wait for ever. Raise UserError naming the first such cell."""
-    nodes = _nodes()
-    for cell in cells:
-        require(
-            any(cell.resources.fit(node) for node in nodes),
-            f"resources: {cell}",
-            f"a machine with {cell.resources} in the cluster",
-            f"none among {len(nodes)}; lower them or add a machine",
-        )
 
 
 def _nodes() -> list[dict[str, Any]]:
