@@ -8,8 +8,7 @@ from typing import Any
 import pytest
 import yaml
 
-from ftl_lightning.apps.ablation import Stage
-from ftl_lightning.apps.ablation.plan import part
+from ftl_lightning.apps.ablation.plan import Stage, part
 from ftl_lightning.apps.ablation.run import check
 from ftl_lightning.cli.main import main
 from ftl_lightning.evaluation.results import read_rows

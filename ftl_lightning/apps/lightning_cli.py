@@ -36,14 +36,14 @@ class CommandLine(LightningCLI):
 
     trainer: Trainer
 
-    def __init__(self, model: type, data: type, args: list[str], **options: Any) -> None:
-        self._asked = args[0] if args else ""
-        super().__init__(model, data, args=args, **options)
+    def __init__(self, verb: str, model: type, data: type, **options: Any) -> None:
+        self._verb = verb
+        super().__init__(model, data, **options)
 
     def subcommands(self) -> dict[str, set[str]]:  # type: ignore[override]
         """The requested verb and its non-option arguments; parsers of all verbs would take a third of the start-up time."""
         verbs = LightningCLI.subcommands() | {"invert": {"model", "datamodule"}}
-        return {verb: names for verb, names in verbs.items() if verb == self._asked}  # none if nothing is run
+        return {verb: names for verb, names in verbs.items() if verb == self._verb}
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
         """Add a common default seed and the evaluator's options."""
@@ -54,22 +54,17 @@ class CommandLine(LightningCLI):
         """Parse arguments, and refuse a seed that numpy does not accept."""
         super().parse_arguments(parser, args)
         verb = self.config.get("subcommand")
-        self._expect_keys(self.config[verb] if verb else self.config, args)
+        config = self.config[verb] if verb else self.config
+        self._expect_keys(config, args)
         for key in ("model", "data"):
-            _expect_values(
-                key, (self.config[verb] if verb else self.config).get(key), [option for option, _ in Arguments.read(args).options]
-            )
-        seed = (self.config[verb] if verb else self.config).get("seed_everything")
+            _expect_values(key, config.get(key), [option for option, _ in Arguments.read(args).options])
+        seed = config.get("seed_everything")
         if isinstance(seed, int) and not isinstance(seed, bool):
             check_range("seed_everything", seed, 0, 2**32 - 1)
 
     @staticmethod
     def _expect_keys(known: Namespace, arguments: Sequence[str]) -> None:
-        """Refuse an unknown key without subkeys in a configuration, which jsonargparse accepts.
-
-        Raises:
-            ArgumentError: with the key.
-        """
+        """Refuse an unknown key without subkeys in a configuration, which jsonargparse accepts."""
         for text in Arguments.read(arguments).values("config"):
             keys = OmegaConf.to_container(OmegaConf.create(text)) if ":" in text else {}
             for key in keys if isinstance(keys, dict) else ():
@@ -89,11 +84,7 @@ class CommandLine(LightningCLI):
             raise UserError(f"model.seed: expected {data} (data.seed), found {model}; give --seed_everything, which sets both")
 
     def _domains(self) -> list[str]:
-        """The domain in the configuration, if any, which a pretrained model's folder may then use.
-
-        Raises:
-            UserError: for a module that is neither installed nor trusted by the user.
-        """
+        """The configured domain, if any, which a pretrained model's folder may then use; an untrusted module is refused."""
         options = (self._get(self.config, "data") or {}).get("init_args") or {}
         domain = options.get("domain")
         if not isinstance(domain, str) or ":" not in domain:
@@ -110,9 +101,8 @@ class CommandLine(LightningCLI):
         return super().instantiate_trainer(**kwargs, callbacks=callbacks)
 
     def before_instantiate_classes(self) -> None:
-        """Claim a log folder that no concurrent run uses: a new folder for an inversion, ``invert``, then ``invert_1`` and so on.
-
-        A pretraining reuses the folder of an earlier run unless that is running. A run from a checkpoint uses the given folder.
+        """Claim a log folder that no concurrent run uses: a new folder for an inversion, ``invert``, then ``invert_1`` and so on. A
+        pretraining reuses the folder of an earlier run unless that is running. A run from a checkpoint uses the given folder.
         """
         if getattr(rank_zero_only, "rank", 0):  # the first process of a run claims the folder
             return
@@ -126,10 +116,6 @@ class CommandLine(LightningCLI):
         elif self._verb in ("fit", "invert"):
             options["version"] = log_folder.claim(folder, name, new=self._verb == "invert")
 
-    @property
-    def _verb(self) -> str:
-        return self.subcommand or ""
-
     def after_fit(self) -> None:
         """Print the folder of the model."""
         folder = self.model.hparams["output"] or Path(self.trainer.log_dir or self.trainer.default_root_dir) / "pretrained"
@@ -139,19 +125,15 @@ class CommandLine(LightningCLI):
         """Print the log folder."""
         say(f"logged in {self.trainer.log_dir or self.trainer.default_root_dir}")
 
-    def before_fit(self) -> None:
-        """Find the last checkpoint, if requested."""
-        self._find_last()
-
     def before_validate(self) -> None:
         """Require a checkpoint; Lightning would evaluate random weights."""
-        self._find_last()
+        self.before_fit()
         if not self.config_init[self._verb].get("ckpt_path"):
             raise UserError(f"ckpt_path: {self._verb} expected a checkpoint file, found none; give --ckpt_path FILE")
 
     before_test = before_validate
 
-    def _find_last(self) -> None:
+    def before_fit(self) -> None:
         """Resolve ``last`` to the path of the last checkpoint; without any, the run starts anew with a note."""
         options = self.config_init[self._verb]
         if options.get("ckpt_path") == "last":
@@ -169,14 +151,7 @@ class CommandLine(LightningCLI):
 
 def _expect_values(key: str, values: Namespace | None, given: Sequence[str]) -> None:
     """Refuse values that jsonargparse accepts: null for an argument without ``None``, and abbreviated names in option groups.
-
-    Args:
-        key: ``model`` or ``data``.
-        values: parsed values.
-        given: names of options on the command line.
-
-    Raises:
-        ArgumentError: with the key.
+    Arguments are ``model`` or ``data``, parsed values, and names of options on the command line.
     """
     if values is None or "class_path" not in values:
         return
@@ -201,8 +176,7 @@ def _expect_values(key: str, values: Namespace | None, given: Sequence[str]) -> 
             raise ArgumentError(None, f'Key "{key}.{name}": expected a value, found null')
 
 
-GROUPS = ("adapter", "budget", "codes", "embeddings", "loss", "modes", "weights")
-"""Option groups of shipped modules."""
+GROUPS = ("adapter", "budget", "codes", "embeddings", "loss", "modes", "weights")  # option groups of shipped modules
 
 
 def _null_in_groups(arguments: Arguments) -> Arguments:
@@ -222,26 +196,13 @@ def _behind(error: BaseException) -> str:
     return str(error)
 
 
-class _Inversion(CommandLine):
-    """Build an inversion without running it."""
-
-    _verb = "invert"
-
-
-class _Fit(CommandLine):
-    """Build a pretraining without running it."""
-
-    _verb = "fit"
-
-
 class _Parser(CommandLine):
     """Parse without building anything."""
 
-    def before_instantiate_classes(self) -> None:
-        """Nothing."""
-
     def instantiate_classes(self) -> None:
         """Nothing."""
+
+    before_instantiate_classes = instantiate_classes
 
 
 def run(verb: str, arguments: Arguments) -> None:
@@ -252,7 +213,7 @@ def run(verb: str, arguments: Arguments) -> None:
 
 def build(verb: str, options: list[str]) -> CommandLine:
     """Parse the options of ``fit`` or ``invert`` and build trainer, model and data without running anything."""
-    line = _command_line(_Inversion if verb == "invert" else _Fit, verb, Arguments.read(options), run=False)
+    line = _command_line(CommandLine, verb, Arguments.read(options), run=False)
     line.trainer.check_alone("what another program runs")  # other processes would repeat its command line
     return line
 
@@ -268,11 +229,7 @@ PACKAGES = ("ftl_lightning", "lightning", "lightning_fabric", "pytorch_lightning
 
 
 def _expect_trusted(verb: str, arguments: Arguments) -> None:
-    """Allow a configuration only classes of packages that are installed or trusted by the user.
-
-    Raises:
-        UserError: with file, key and module of another class.
-    """
+    """Allow a configuration only classes of packages that are installed or trusted by the user; others are a UserError."""
     packages = set(PACKAGES)
     sources = [(str(path), keys) for given in arguments.configurations() for path, keys in parts(given, verb)]
     for where, keys in (*sources, ("options", dict(arguments.options))):
@@ -287,9 +244,7 @@ def _command_line(kind: type[CommandLine], verb: str, arguments: Arguments, run:
     warnings.filterwarnings("ignore", message=".*does not have many workers.*")  # data are in memory
     warnings.filterwarnings("ignore", message=".*`IterableDataset` has `__len__` defined.*")  # there are no workers
     warnings.filterwarnings("ignore", message=".*module.s. in eval mode at the start of training.*")  # averaged or frozen
-    warnings.filterwarnings(
-        "ignore", message=".*resuming from a checkpoint that ended before the epoch ended.*"
-    )  # steps are stateless
+    warnings.filterwarnings("ignore", message=".*a checkpoint that ended before the epoch ended.*")  # steps are stateless
     warnings.filterwarnings("ignore", message=".*is smaller than the logging interval.*")  # in short runs
     warnings.filterwarnings("ignore", message=".*LightningCLI's args parameter is intended.*")
     warnings.filterwarnings("ignore", message=".*`isinstance.treespec, LeafSpec.` is deprecated.*")  # within Lightning
@@ -298,6 +253,7 @@ def _command_line(kind: type[CommandLine], verb: str, arguments: Arguments, run:
     logging.getLogger("lightning.fabric.strategies.launchers").setLevel(logging.INFO)  # reports a process that ended early
     try:
         return kind(
+            verb,
             pl.LightningModule,
             pl.LightningDataModule,
             trainer_class=Trainer,

@@ -4,14 +4,10 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from ftl_lightning.services.errors import about
 from ftl_lightning.services.text import line, say
 from ftl_lightning.services.validation import LARGEST_STEP, check_count, check_range
-
-if TYPE_CHECKING:
-    pass
 
 
 @dataclass(frozen=True)

@@ -132,7 +132,8 @@ def check(options: CheckOptions) -> None:
     demonstrations, broken = read_mended(options.file)
     model = FewShot.from_pretrained(options.pretrained, options.settings or None) if options.pretrained else None
     if model is not None:
-        demonstrations = _fitting(model, demonstrations, options.file)
+        with about(options.file):
+            demonstrations = model.demonstrations(demonstrations, name=Path(options.file).stem)
     checks = []
     for text in dict.fromkeys(demonstrations.concepts):
         rows = [row for row, concept in enumerate(demonstrations.concepts) if concept == text]
@@ -147,11 +148,6 @@ def check(options: CheckOptions) -> None:
         with atomic(options.figure) as temporary:
             check_figure(checks).savefig(temporary, dpi=110)
         say(options.figure)
-
-
-def _fitting(model: "FewShot", demonstrations: "Demonstrations", path: str) -> "Demonstrations":
-    with about(path):
-        return model.demonstrations(demonstrations, name=Path(path).stem)
 
 
 def _checked(model: "FewShot | None", demonstrations: "Demonstrations", faults: "tuple[Finding, ...]", learn: bool) -> "Check":

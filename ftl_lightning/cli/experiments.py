@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from ftl_lightning.apps.ablation import Stage
+from ftl_lightning.apps.ablation.plan import Stage
 from ftl_lightning.services.errors import UserError, require, short
 from ftl_lightning.services.text import line, say
 from ftl_lightning.services.validation import check_count
@@ -113,11 +113,7 @@ def benchmark(options: BenchmarkOptions) -> None:
 
 
 def _named(text: str, key: str) -> list[str]:
-    """Names of suites.
-
-    Raises:
-        UserError: for an unknown or repeated name.
-    """
+    """Names of suites. Raise UserError for an unknown or repeated name."""
     from ftl_lightning.apps.benchmark.suite import suite_names
 
     names = [name.strip() for name in text.split(",") if name.strip()]
@@ -128,10 +124,8 @@ def _named(text: str, key: str) -> list[str]:
 
 
 def _chosen(options: BenchmarkOptions) -> list[str]:
-    """The named suites; without names all that the method can run here, with notes on the others.
-
-    Raises:
-        UserError: for a named suite that cannot be run here.
+    """The named suites, or all that the method can run here, with notes on the others. Raise UserError if a named one cannot be
+    run.
     """
     from ftl_lightning.apps.benchmark.run import missing_of
     from ftl_lightning.apps.benchmark.suite import load_suite, suite_names
@@ -193,11 +187,7 @@ def _run(options: BenchmarkOptions) -> None:
 
 
 def _resumed(known: "Submission", begun: "Submission", out: Path) -> "Submission":
-    """Resume a submission from its file.
-
-    Raises:
-        UserError: for a file of another method, code, version, machine or set of suites.
-    """
+    """Resume a submission from its file. Raise UserError for a file of another method, code, version, machine or set of suites."""
     from dataclasses import replace
 
     for key in ("kind", "format", "method", "name", "code", "version", "machine"):
@@ -233,8 +223,7 @@ def _check(options: BenchmarkOptions) -> None:
     require(not differences, str(path), "the submitted numbers", f"{len(differences)} that differ; see above")
 
 
-MOST_WORKERS = 1000
-"""Maximum number of parallel cells."""
+MOST_WORKERS = 1000  #: Maximum number of parallel cells.
 
 
 @dataclass(frozen=True)

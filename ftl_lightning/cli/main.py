@@ -24,11 +24,9 @@ class Command:
 
     Attributes:
         summary: line of the overview.
-        function: what runs; called with the options class, or without it with the function's own arguments.
-        options: options class.
+        function, options: what runs, called with the options class, or without it with its own arguments.
         positional: whether required arguments are positional.
-        first: option that may also be the first positional argument.
-        several: option that collects positional arguments.
+        first, several: option that may also be the first positional argument, and option that collects them all.
         repeated: option that may be repeated.
     """
 
@@ -116,14 +114,7 @@ _INVERT = Command(TRAINER_VERBS["invert"], concepts.invert, concepts.InvertOptio
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one verb.
-
-    Args:
-        arguments: command-line arguments without the program's name.
-
-    Returns:
-        Exit code: 0; 2 for a user's mistake, or 130 for an interruption, each with a line on standard error.
-    """
+    """Run one verb, by default of this process's command line; return 0, or 2 for a user's mistake, 130 for an interruption."""
     verb, *words = (sys.argv[1:] if arguments is None else arguments) or ["--help"]
     read = Arguments.read(words)
     any_terminal()

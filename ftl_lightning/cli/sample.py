@@ -149,11 +149,7 @@ def _check_sample(options: SampleOptions, domain: "Domain") -> None:
 
 
 def _export_files(export: str, count: int) -> list[Path]:
-    """A file for each sample, numbered if there are several.
-
-    Raises:
-        UserError: before sampling, if an existing path is not a file.
-    """
+    """A file for each sample, numbered if there are several. Raise UserError before sampling, if an existing path is not a file."""
     from ftl_lightning.services.files import check_file
 
     if not export:

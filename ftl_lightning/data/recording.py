@@ -10,13 +10,11 @@ from gymnasium.spaces import Box
 from numpy.typing import ArrayLike, NDArray
 
 from ftl_lightning.data.demonstrations import Demonstrations
-from ftl_lightning.data.formats.episodes import Episode, Metadata, from_episodes
+from ftl_lightning.data.formats.episodes import PART, Episode, Metadata, from_episodes
 from ftl_lightning.services.errors import UserError, require, short
 
 Part = str | Callable[[Any], ArrayLike]
 """Part of an observation: a key, or a function of the observation."""
-PART = "observation"
-"""Key of the states in observations of several parts, as in Gymnasium's environments with goals."""
 
 
 def states_part(space: gymnasium.Space[Any], part: str = "") -> str:

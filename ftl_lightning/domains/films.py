@@ -172,8 +172,8 @@ def drawn(wireframe: Wireframe) -> Frames:
         for index in np.argsort(depth):  # nearer lines on top
             a, b = wireframe.lines[index]
             _line(pen, frame[a], frame[b], wireframe.colours[index], LIMB * scale)
-        for point, radius, colour in wireframe.heads:
-            _ball(pen, frame[point], radius * scale, colour)
+        for point, radius, head_colour in wireframe.heads:
+            _ball(pen, frame[point], radius * scale, head_colour)
         pictures.append(np.asarray(picture.resize((SIZE, SIZE), Image.Resampling.BOX), dtype=np.uint8))
     return pictures
 

@@ -32,32 +32,18 @@ from ftl_lightning.reporting.table import (
 from ftl_lightning.reporting.tables import against, as_learned_most
 from ftl_lightning.training.method import load_method
 
-BASELINES = tuple(load_method(name).name for name in ("bc", "cvae", "in_context", "language"))
-"""Names of the paper's baselines."""
+BASELINES = tuple(load_method(name).name for name in ("bc", "cvae", "in_context", "language"))  # names of the paper's baselines
 LANGUAGE = BASELINES[-1]
-METHODS = (
-    PAPERS_METHOD,
-    Compared(OURS, CHOSEN),
-    Compared(OURS, WITH_MODES),
-    *map(Compared, BASELINES),
-    Compared(FINE_TUNED),
-)
+METHODS = (PAPERS_METHOD, Compared(OURS, CHOSEN), Compared(OURS, WITH_MODES), *map(Compared, BASELINES), Compared(FINE_TUNED))
 """Order of methods in tables; our other forms follow ours, other methods come last."""
-ALIKE = 0.9
-"""Minimum share of episodes with our outcome for which a reference policy is annotated."""
-LINES = 10
-"""Maximum number of lines of the short overview."""
-MEASURED = ("measured", "spread over seeds")
-"""Columns of a number in the comparison."""
-OTHER_FORMS = "other forms"
-"""Column of our forms other than the paper's."""
+ALIKE = 0.9  # minimum share of episodes with our outcome for which a reference policy is annotated
+LINES = 10  # maximum number of lines of the short overview
+MEASURED = ("measured", "spread over seeds")  # columns of a number in the comparison
+OTHER_FORMS = "other forms"  # column of our forms other than the paper's
 
 
 def all_methods(comparison: pd.DataFrame, ablations: pd.DataFrame) -> pd.DataFrame:
-    """Rows of all domains with a measured baseline: from the comparison, or from ablations for domains that it lacks.
-
-    Ablations contribute the most measured configuration of each method.
-    """
+    """Rows of all domains with a measured baseline: of the comparison, or of the most measured configurations in ablations."""
     compared_domains = set(comparison["domain"])
     others = [
         as_learned_most(domain_of(str(name), rows), rows)
@@ -86,9 +72,8 @@ def methods(rows: pd.DataFrame) -> list[Compared]:
 
 
 def comparison_table(domain: Domain, results: pd.DataFrame, shown: Sequence[str] = ()) -> Table:
-    """Table of all methods: paired test, mean with errors, the paper's number and the difference.
-
-    There is a line for each setting, metric in ``shown`` (if empty, those by which methods are compared), and method.
+    """Table of all methods, with a line for each setting, metric in ``shown`` (by default those of the comparison), and method:
+    paired test, mean with errors, the paper's number and the difference.
     """
     rows = compared(domain, results)
     lines = []

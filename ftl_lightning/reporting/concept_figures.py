@@ -15,20 +15,13 @@ from ftl_lightning.services.text import figure_text
 from ftl_lightning.training.checks import Check
 from ftl_lightning.training.concept_model import ConceptModel
 
-MOST = 20
-"""Maximum number of concepts in the figure of a check."""
+MOST = 20  # maximum number of concepts in the figure of a check
 GOOD, ODD = "#3f6fb5", "#d03a3a"
 
 
 @dataclass(frozen=True)
 class Place:
-    """An embedding in the plane.
-
-    Attributes:
-        concept: name of the concept.
-        component: ``'k1'`` for the first, empty for a training concept.
-        x, y: coordinates.
-    """
+    """An embedding in the plane; ``component`` is ``'k1'`` for a concept's first, empty for a training concept."""
 
     concept: str
     component: str
@@ -42,15 +35,8 @@ class Place:
 
 
 def concept_places(model: ConceptModel, concepts: Sequence[Concept], seed: int = 0) -> list[Place]:
-    """t-SNE of training concepts and learned components (paper, figure 'tsne'; van der Maaten & Hinton, 2008), in this order.
-
-    Args:
-        model: the pretrained model.
-        concepts: concepts learned with it.
-        seed: seed of t-SNE.
-
-    Raises:
-        UserError: if scikit-learn is missing.
+    """t-SNE of training concepts and learned components (paper, figure 'tsne'; van der Maaten & Hinton, 2008), in this order. Raise
+    UserError if scikit-learn is missing.
     """
     check_extra("notebooks", "concept_map")
     from sklearn.manifold import TSNE
@@ -85,10 +71,7 @@ def concept_map(model: ConceptModel, concepts: Sequence[Concept], seed: int = 0)
 
 
 def check_figure(checks: Sequence[Check]) -> Figure:
-    """Plot demonstrations, their distances and leave-one-out losses; odd or faulty demonstrations are red.
-
-    There is a row for each concept, at most :data:`MOST`.
-    """
+    """Plot demonstrations, distances and leave-one-out losses, odd ones in red; a row for each of :data:`MOST` concepts at most."""
     shown = checks[:MOST]
     columns = 2 + 2 * any(check.left_out for check in shown)
     figure = Figure(figsize=(3.2 * columns, 3.0 * len(shown)), layout="constrained")

@@ -38,23 +38,15 @@ OF_METHODS: Mapping[Compared, str] = {
 """Colour of each method, the same in all figures: Okabe and Ito's (2008) and Tol's (2021), safe for colour-blind readers."""
 SPARE = ("#117733", "#ddcc77", "#88ccee", "#555555")
 """Colours of user methods, used before colours of methods that a figure lacks."""
-COLOURS = (*dict.fromkeys(OF_METHODS.values()), *SPARE)
-"""Colours in order, for lines that are not methods."""
+COLOURS = (*dict.fromkeys(OF_METHODS.values()), *SPARE)  # colours in order, for lines that are not methods
 PAPER_COLOUR = "#9a9a9a"
-LINES = ("dotted", "dashed", "dashdot", (0, (1, 4)), (0, (6, 2, 1, 2, 1, 2)), "solid")
-"""Line styles of reference policies."""
-REFERENCE_MARKS = {REPLAYED: "X", FRESH: "*"}
-"""Markers of the reference lines of novelty and coverage."""
-WIDEST = 60.0
-"""Maximum width of a figure in inches; a figure of thousands of settings would fill the memory."""
+LINES = ("dotted", "dashed", "dashdot", (0, (1, 4)), (0, (6, 2, 1, 2, 1, 2)), "solid")  # line styles of reference policies
+REFERENCE_MARKS = {REPLAYED: "X", FRESH: "*"}  # markers of the reference lines of novelty and coverage
+WIDEST = 60.0  # maximum width of a figure in inches; a figure of thousands of settings would fill the memory
 
 
 def colours(named: Iterable[tuple[str, Compared]]) -> dict[str, str]:
-    """Assign a colour to each name: its method's colour, else the colour of another form, else a spare colour.
-
-    Args:
-        named: names in a figure with their methods; user methods have spare colours.
-    """
+    """Assign a colour to each name of a method: its method's colour, else the colour of another form, else a spare colour."""
     chosen: dict[str, str] = {}
     waiting: dict[str, Compared] = {}
     for name, method in named:
@@ -94,9 +86,8 @@ def _label_bars(axes: Axes, places: Sequence[float], shown: Sequence[str], metri
 
 
 def accuracy_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy") -> Figure:
-    """Plot a metric of every setting beside the paper's numbers and reference lines, for K = 2 or else the most measured K.
-
-    Error bars are standard errors over tasks. ``results`` are rows of a results file.
+    """Plot a metric of every setting beside the paper's numbers and reference lines, for K = 2 or else the most measured K. Error
+    bars are standard errors over tasks. ``results`` are rows of a results file.
     """
     rows = labelled(latest(select(results, domain=domain.name, metric=metric)))
     ours, how = main_rows(rows, main_omega(domain))
@@ -124,9 +115,8 @@ def accuracy_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy
 
 
 def comparison_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy") -> Figure:
-    """Plot a metric of every setting for ours and the baselines, with reference lines and the paper's numbers as diamonds.
-
-    Error bars are standard errors over tasks. ``results`` are rows of a comparison.
+    """Plot a metric of every setting for ours and the baselines, with reference lines and the paper's numbers as diamonds. Error
+    bars are standard errors over tasks. ``results`` are rows of a comparison.
     """
     rows = compared(domain, results)
     names = methods(rows)
@@ -157,16 +147,13 @@ def comparison_bars(domain: Domain, results: pd.DataFrame, metric: str = "accura
     return figure
 
 
-MARKS = "os^Pv*X<h>p8d"
-"""Markers of methods in the overview."""
-ROW = 0.5
-"""Height of a line of the overview in inches."""
+MARKS = "os^Pv*X<h>p8d"  # markers of methods in the overview
+ROW = 0.5  # height of a line of the overview in inches
 
 
 def overview_dots(results: pd.DataFrame) -> Figure:
-    """Plot all domains, settings and metrics of a comparison: a marker for each method, with standard errors over tasks.
-
-    Open diamonds are the paper's numbers of the same method; ticks are reference lines. Our forms are limited to the paper's,
+    """Plot all domains, settings and metrics of a comparison: a marker for each method, with standard errors over tasks. Open
+    diamonds are the paper's numbers of the same method; ticks are reference lines. Our forms are limited to the paper's,
     automatically chosen forms and the default forms of the domains. Rows are those of
     :func:`~ftl_lightning.reporting.comparison.all_methods`.
     """
@@ -267,10 +254,9 @@ def growth(domain: Domain, results: pd.DataFrame) -> Figure:
 
 
 def frontier(domain: Domain, rows: pd.DataFrame) -> Figure:
-    """Plot accuracy over coverage for each suite and setting: a line for each method, temperature from dark to light.
-
-    Points are means over tasks and seeds. Less coverage is better, so better methods lie further up and to the left. Crosses and
-    stars are the reference lines *demonstrations replayed* and *fresh samples*. Rows are those of
+    """Plot accuracy over coverage for each suite and setting: a line for each method, temperature from dark to light. Points are
+    means over tasks and seeds. Less coverage is better, so better methods lie further up and to the left. Crosses and stars are the
+    reference lines *demonstrations replayed* and *fresh samples*. Rows are those of
     :func:`~ftl_lightning.reporting.measurements.read_frontier`.
     """
     rows = rows[rows["domain"] == domain.name].dropna(subset=["accuracy", "coverage"])

@@ -22,12 +22,10 @@ from ftl_lightning.services.tensor_file import write_text
 from ftl_lightning.services.validation import from_mapping, read_json
 
 T = TypeVar("T")
-SPEED = "speed.json"
-"""File of accuracy over learning time in a folder of results; ``benchmarks/speed/speed.py`` writes it."""
+SPEED = "speed.json"  # file of accuracy over learning time in a folder of results; ``benchmarks/speed/speed.py`` writes it
 PUBLISHED, ONE, TEN = "published procedure, one concept", "ours, one concept", "ours, ten concepts together"
 """Names of the curves."""
-WITHIN = 0.02
-"""Tolerance below the final accuracy that counts as reached."""
+WITHIN = 0.02  # tolerance below the final accuracy that counts as reached
 FRONTIER = "frontier.json"
 """File of accuracy over coverage in a folder of results; ``benchmarks/experiments/frontier.py`` writes it."""
 NOISY = "demonstrations with noise"
@@ -40,17 +38,8 @@ COLUMNS = [*SUBJECT, *_MEASURES]
 
 
 def _read(path: str | Path, name: str, key: str, kind: Callable[..., T], expected: str) -> list[T]:
-    """Read the rows of a file; empty if there is no file.
-
-    Args:
-        path: the file, or its folder.
-        name: name of the file in a folder.
-        key: key of the rows.
-        kind: dataclass of a row; ``null`` counts as missing.
-        expected: expected content, for messages.
-
-    Raises:
-        UserError: for an invalid file, naming file and row.
+    """Rows of a file, or of the file ``name`` in a folder, under ``key``; empty if there is none, and ``null`` counts as missing.
+    Raise UserError for a file without the expected content, naming file and row.
     """
     path = Path(path)
     path = path / name if path.is_dir() else path
@@ -61,25 +50,17 @@ def _read(path: str | Path, name: str, key: str, kind: Callable[..., T], expecte
         rows = content.get(key) if isinstance(content, dict) else None
         if not isinstance(rows, list):
             raise UserError(f"key {key!r}: expected a list, found {shown(rows)}")
-        return [from_mapping(kind, _without_null(row), f"{key}[{number}]") for number, row in enumerate(rows)]
+        known = [{name: row[name] for name in row if row[name] is not None} if isinstance(row, dict) else row for row in rows]
+        return [from_mapping(kind, row, f"{key}[{number}]") for number, row in enumerate(known)]
     except UserError as error:
         reason = str(error).removeprefix(f"{path}: ")
         raise UserError(f"{path}: expected {expected}, found something else ({reason})") from error
 
 
-def _without_null(row: object) -> object:
-    return {name: value for name, value in row.items() if value is not None} if isinstance(row, dict) else row
-
-
 @dataclass(frozen=True)
 class Measured:
-    """A point of a curve.
-
-    Attributes:
-        curve: name of the curve, such as :data:`PUBLISHED`.
-        steps: gradient steps; mean over concepts if each stops by itself.
-        seconds: learning time.
-        accuracy: mean over concepts of the share of plans that show the concept.
+    """A point of a curve: gradient steps (mean over concepts), seconds of learning, and the share of right plans (mean over
+    concepts).
     """
 
     curve: str
@@ -147,10 +128,7 @@ def accuracy_at(rows: pd.DataFrame, coverage: float) -> float | None:
 
 
 def frontier_table(domain: Domain, rows: pd.DataFrame) -> Table:
-    """Accuracy, novelty and coverage of each method at every temperature, from rows of :func:`read_frontier`.
-
-    The last column is its accuracy at the coverage of the paper's form at temperature 1.
-    """
+    """Accuracy, novelty and coverage of each method at every temperature, and accuracy at the coverage of the paper's form at 1."""
     lines = []
     rows = rows[rows["domain"] == domain.name].dropna(subset=["coverage"])
     for (suite, setting), setting_rows in rows.groupby(["suite", "setting"], sort=False):

@@ -30,24 +30,13 @@ from ftl_lightning.training.model_folder import load_model
 from ftl_lightning.version import __version__
 
 HERE = Path(__file__).parent
-FILMS, CONCEPTS = "films", "concepts"
-"""Subfolders of the results: files of ``evaluation.films``, and concepts by domain and seed."""
-MOST = 15_000_000
-"""Page size in bytes above which a note is printed."""
+FILMS, CONCEPTS = "films", "concepts"  # subfolders of the results: files of ``evaluation.films``, and concepts by domain and seed
+MOST = 15_000_000  # page size in bytes above which a note is printed
 
 
 def write_page(results: Path, path: Path) -> int:
-    """Write the page.
-
-    Args:
-        results: folder of results, with films and learned concepts in :data:`FILMS` and :data:`CONCEPTS`.
-        path: the HTML file.
-
-    Returns:
-        Its size in bytes.
-
-    Raises:
-        UserError: if there are no results, or a file of films is invalid.
+    """Write the page of a folder of results, with :data:`FILMS` and :data:`CONCEPTS`, and return its bytes' number. Raise UserError
+    if there are no results, or a file of films is invalid.
     """
     rows = read_rows(results)
     compared_rows = all_methods(read_study(results, COMPARISON), read_study(results))
@@ -104,11 +93,7 @@ def _line(domain: Domain, setting: str, metric: str, results: pd.DataFrame) -> d
 
 
 def _films(results: Path, shown: Sequence[Domain], rows: pd.DataFrame) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """Films with their subjects, and the shapes of each file of films.
-
-    Raises:
-        UserError: for a file without films.
-    """
+    """Films with their subjects, and the shapes of each file of films. Raise UserError for a file without films."""
     of_domain = {domain.name: select(rows, domain=domain.name) for domain in shown}
     measured = {domain.name: decisive(domain, of_domain[domain.name]) for domain in shown}
     decided = {name: select(group, metric=measured[name]) for name, group in of_domain.items()}

@@ -11,26 +11,18 @@ from scipy.stats import binom
 from ftl_lightning.domains.comparison import Compared
 from ftl_lightning.evaluation.results import label
 
-LEVEL = 0.05
-"""Significance level of p."""
-EXACT = 20
-"""Maximum number of differences for the exact test."""
-DRAWS = 10_000
-"""Number of drawn sign patterns otherwise."""
-ROUNDING = 2e-6
-"""Tolerance for equal means; results have six digits."""
+LEVEL = 0.05  # significance level of p
+EXACT = 20  # maximum number of differences for the exact test
+DRAWS = 10_000  # number of drawn sign patterns otherwise
+ROUNDING = 2e-6  # tolerance for equal means; results have six digits
 AHEAD, BEHIND, UNSHOWN, UNDECIDED = "ahead", "behind", "no difference shown", "undecided"
 SAME = "the same in every task and seed"
 
 
 def sign_flip(parts: Sequence[float]) -> float:
-    """Two-sided p of a sum of paired differences under random signs.
-
-    If neither method is better, both signs of a difference are equally likely. The test is exact up to :data:`EXACT` nonzero
-    differences; else p is (b + 1) / (draws + 1), where b of :data:`DRAWS` drawn sums are at least as far from zero.
-
-    Args:
-        parts: contribution of each pair to the mean difference.
+    """Two-sided p of a sum of paired differences under random signs: if neither method is better, both signs are equally likely.
+    The test is exact up to :data:`EXACT` nonzero differences; else p is (b + 1) / (draws + 1), where b of :data:`DRAWS` drawn sums
+    are at least as far from zero. ``parts`` are the contributions of the pairs to the mean difference.
     """
     moving = np.array([part for part in parts if abs(part) > ROUNDING])
     far = abs(moving.sum()) - ROUNDING
@@ -44,9 +36,8 @@ def sign_flip(parts: Sequence[float]) -> float:
 
 
 def holm(values: Sequence[float]) -> list[float]:
-    """Corrected p values of several tests, in the given order (Holm, 1979).
-
-    The smallest is multiplied by the number of tests, the next by one less, and so on; corrected values never decrease.
+    """Corrected p values of several tests, in the given order (Holm, 1979): the smallest times the number of tests, and so on,
+    ascending.
     """
     adjusted, largest = [1.0] * len(values), 0.0
     for rank, index in enumerate(sorted(range(len(values)), key=values.__getitem__)):
@@ -65,11 +56,9 @@ class Lead:
     """Ours against a baseline, in one setting and metric.
 
     Attributes:
-        baseline: the baseline.
         difference: mean over tasks of means over seeds; positive if ours is better.
-        pairs: number of pairs (task, seed) with both methods.
+        pairs, same: number of pairs (task, seed) with both methods, and whether every pair is equal.
         p: p after Holm's correction; ``None`` for too few pairs.
-        same: whether every pair is equal.
     """
 
     baseline: Compared
@@ -129,12 +118,8 @@ def leads(rows: pd.DataFrame, ours: Compared, baselines: Sequence[Compared], les
 
     Args:
         rows: rows of one setting and metric, with ``task``, ``seed``, ``method``, ``form`` and ``value``.
-        ours: our method.
         baselines: methods to compare with; methods without rows are left out.
         less: whether less is better.
-
-    Returns:
-        Leads in the order of ``baselines``; empty without measurements of ours or of any baseline.
     """
     values = {
         Compared(*map(str, named)): measured.groupby(["task", "seed"])["value"].mean() * (-1 if less else 1)
@@ -167,22 +152,16 @@ def _parts(differences: pd.Series, tests: int) -> list[float]:
 
 
 def least_certain(compared: Sequence[Lead]) -> Lead | None:
-    """The lead for a single verdict: *ahead* is ahead of every baseline, *behind* is behind at least one.
-
-    Among equal verdicts it is the lead over the best baseline. ``None`` without leads.
+    """The lead for a single verdict: *ahead* of every baseline, or *behind* at least one; if equal, over the best. ``None`` without
+    leads.
     """
     return min(compared, key=lambda lead: ({BEHIND: 0, AHEAD: 2}.get(lead.verdict, 1), lead.difference), default=None)
 
 
 def episodes(won: int, lost: int, count: int) -> str:
-    """Format a paired difference of success rates with 95 % interval, McNemar's exact p and the number of equal outcomes.
-
-    The interval is Wald's with half an episode added to each of the four outcomes (Agresti & Min, 2005); otherwise it has no width
-    when no episode differs.
-
-    Args:
-        won, lost: number of pairs in which only the first, or only the second, succeeds.
-        count: number of all pairs.
+    """Format a paired difference of success rates with 95 % interval, McNemar's exact p and the number of equal outcomes. In
+    ``won`` or ``lost`` pairs of ``count`` only the first, or only the second, succeeds. The interval is Wald's with half an episode
+    added to each of the four outcomes (Agresti & Min, 2005); otherwise it has no width when no episode differs.
     """
     apart, all_four = won + lost, count + 2
     middle = (won - lost) / all_four

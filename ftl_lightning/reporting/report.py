@@ -29,26 +29,19 @@ from ftl_lightning.services.files import read_text
 from ftl_lightning.services.tensor_file import atomic, write_text
 from ftl_lightning.services.text import say
 
-BEGIN, END = "<!-- results: begin -->", "<!-- results: end -->"
-"""Lines around the text that ``report --readme`` writes."""
-MOST_DOMAINS, MOST_CELLS = 100, 10_000
-"""Maximum number of domains of a report, and of cells of a domain's tables."""
+BEGIN, END = "<!-- results: begin -->", "<!-- results: end -->"  #: Lines around the text that ``report --readme`` writes.
+MOST_DOMAINS, MOST_CELLS = 100, 10_000  #: Maximum number of domains of a report, and of cells of a domain's tables.
 
 
 def write_report(results: Path, out: Path, readme: Path | None = None) -> str:
-    """Write Markdown, LaTeX and figures.
+    """Write Markdown, LaTeX and figures, and return all tables as Markdown. Raise UserError if there are no results, or the
+    Markdown file has no marks.
 
     Args:
         results: a results file, or a folder of them.
-        out: output folder, with a subfolder for each domain.
+        out: output folder, with a subfolder for each domain and the complete overview.
         readme: a Markdown file whose part between two marks is replaced by the short overview of the comparison, or without a
-            comparison by each domain's main table. The complete overview is ``overview.md`` in ``out``.
-
-    Returns:
-        All tables as Markdown.
-
-    Raises:
-        UserError: if there are no results, or the Markdown file has no marks.
+            comparison by each domain's main table.
     """
     rows = read_rows(results)
     ablations, comparison, curves, changes = (read_study(results, name) for name in ("", COMPARISON, CURVES, CHANGES))

@@ -18,12 +18,9 @@ from ftl_lightning.services.errors import UserError, require, shown
 from ftl_lightning.services.text import latex, latex_row, markdown, say
 
 MISSING = "-"
-PAPERS = ("paper", "difference")
-"""Columns of tables of domains with a paper."""
-MOST_COLUMNS = 8
-"""Maximum columns of a table in the documentation."""
-TRAINING, PAPER = "training", "paper"
-"""Suites that come first in reports, if a domain has them."""
+PAPERS = ("paper", "difference")  #: Columns of tables of domains with a paper.
+MOST_COLUMNS = 8  #: Maximum columns of a table in the documentation.
+TRAINING, PAPER = "training", "paper"  #: Suites that come first in reports, if a domain has them.
 
 
 @dataclass(frozen=True)
@@ -64,13 +61,7 @@ def summarise(rows: pd.DataFrame) -> Number | None:
 
 @dataclass(frozen=True)
 class Table:
-    """A table.
-
-    Attributes:
-        name: name of its files.
-        caption: a sentence.
-        cells: rows and columns of text.
-    """
+    """A table: name of its files, a sentence, and rows and columns of text."""
 
     name: str
     caption: str
@@ -130,11 +121,7 @@ def beside_paper(number: Number | None, papers: Published | None) -> list[str]:
 
 
 def domain_of(name: str, rows: pd.DataFrame) -> Domain:
-    """The domain of results; for user data or a domain that is not installed, reconstructed from the rows.
-
-    Raises:
-        UserError: for a name that cannot be a folder of a report.
-    """
+    """The domain of results; if it is not installed, or of user data, made from the rows. Raise UserError for an invalid name."""
     is_name = re.fullmatch(r"\w[\w .+-]{0,99}", name)
     require(is_name, "results: column 'domain'", "a name of letters, digits and - . +", shown(name))
     if name != OWN and not is_known(name):
@@ -221,10 +208,8 @@ def lookup(
     """The paper's number, or ``None``.
 
     Args:
-        domain: the domain.
         setting, metric, task: as in a row of the results; without a task the mean of the setting.
-        components: K; ignored for baselines.
-        omega: guidance weight as text; empty for the weight of the paper's main figures; ignored for baselines.
+        components, omega: K and guidance weight as text (empty for that of the paper's main figures); ignored for baselines.
         method: ours, or a baseline; of our forms, only the paper's has numbers.
     """
     learned = (components, omega or papers_omega(domain))
@@ -236,9 +221,8 @@ def lookup(
 
 
 def headlines(domain: Domain, rows: pd.DataFrame) -> list[tuple[str, str]]:
-    """Settings and metrics of short tables: those with numbers of the paper, then the same settings in closed loop.
-
-    Without a paper: the first setting of the suite ``paper``, else all settings, each with its decisive metric.
+    """Settings and metrics of short tables: those with numbers of the paper, then the same in closed loop. Without a paper: the
+    first setting of the suite ``paper``, else all settings, each with its decisive metric.
     """
     measured = set(zip(rows["setting"], rows["metric"], strict=True))
     measured_settings = settings(domain, rows)

@@ -34,17 +34,12 @@ from ftl_lightning.reporting.table import (
 )
 from ftl_lightning.services.errors import UserError
 
-USUAL_K = 2
-"""Number of components in the main tables, as in the paper."""
-LEARNED = "learned"
-"""Value of ``omega`` for learned guidance weights."""
-AXES = {"demonstrations": "K", "K": "demonstrations"}
-"""Axes of curves: the varied column, and the column that stays fixed."""
-BESIDE = ("method", "measured", *PAPERS)
-"""Last columns of the tables of our method in all its forms."""
+USUAL_K = 2  #: Number of components in the main tables, as in the paper.
+LEARNED = "learned"  #: Value of ``omega`` for learned guidance weights.
+AXES = {"demonstrations": "K", "K": "demonstrations"}  #: Axes of curves: the varied column, and the column that stays fixed.
+BESIDE = ("method", "measured", *PAPERS)  #: Last columns of the tables of our method in all its forms.
 
-Papers = Callable[..., Published | None]
-"""The paper's number by the keyword ``method``."""
+Papers = Callable[..., Published | None]  #: The paper's number by the keyword ``method``.
 
 
 def labelled(rows: pd.DataFrame) -> pd.DataFrame:
@@ -60,11 +55,7 @@ def _cell(rows: pd.DataFrame) -> str:
 
 
 def _table(
-    domain: Domain,
-    name: str,
-    caption: str,
-    heads: Sequence[str],
-    subjects: Sequence[tuple[Sequence[str], Papers, pd.DataFrame]],
+    domain: Domain, name: str, caption: str, heads: Sequence[str], subjects: Sequence[tuple[Sequence[str], Papers, pd.DataFrame]]
 ) -> Table:
     """A table with a line for each method of each subject: first cells, the paper's numbers, and labelled rows."""
     lines = []
@@ -99,15 +90,8 @@ def _weightings(rows: pd.DataFrame) -> list[tuple[int, str]]:
 
 
 def main_rows(rows: pd.DataFrame, omega: str) -> tuple[pd.DataFrame, str]:
-    """Rows of a main table: for each method and setting two components with the main weight, or else the most measured weighting.
-
-    Args:
-        rows: rows with labels, see :func:`labelled`.
-        omega: guidance weight of the main tables.
-
-    Returns:
-        The rows, with the weighting of ours in the column ``mark`` where it differs from the caption's; and the caption's words
-        for the weighting.
+    """Rows of a main table, and the words of its caption: for each method and setting two components with the main weight
+    ``omega``, or else the most measured weighting, which the column ``mark`` then names. Rows have labels, see :func:`labelled`.
     """
     rows = select(rows, role=METHOD)
     usual = (USUAL_K, omega)
@@ -128,10 +112,8 @@ def main_rows(rows: pd.DataFrame, omega: str) -> tuple[pd.DataFrame, str]:
 
 
 def as_learned_most(domain: Domain, rows: pd.DataFrame) -> pd.DataFrame:
-    """Rows of a single configuration for each method, form and setting, and all reference lines.
-
-    The guidance weight is that of the main tables (:func:`main_rows`). Variant and number of demonstrations are the most measured;
-    ties go to more demonstrations.
+    """Rows of a single configuration for each method, form and setting, and all reference lines. The guidance weight is that of the
+    main tables (:func:`main_rows`). Variant and number of demonstrations are the most measured; ties go to more demonstrations.
     """
     chosen, _ = main_rows(labelled(latest(rows)), main_omega(domain))
     kept = []
@@ -204,10 +186,8 @@ def _outcomes(domain: Domain, rows: pd.DataFrame) -> list[Table]:
 
 
 def against(ours: pd.DataFrame, policy: str) -> tuple[int, int, int] | None:
-    """Episodes that only ours wins, episodes that only the policy wins from the same start, and all; ``None`` without rows.
-
-    Raises:
-        UserError: for counts that are impossible.
+    """Episodes that only ours wins, that only the policy wins from the same start, and all, or ``None``. Raise UserError for
+    impossible counts.
     """
     won, lost = (select(ours, metric=f"{begin}{policy}") for begin in (WON, LOST))
     if won.empty:
@@ -244,10 +224,7 @@ def _paired(domain: Domain, rows: pd.DataFrame) -> Table:
 
 
 def _ablation(domain: Domain, name: str, caption: str, ours: pd.DataFrame, column: str) -> Table:
-    """Ablation of the number of learned concepts (column ``K``) or of the guidance weight (column ``omega``).
-
-    Metrics are the main metric, failures in closed loop, and the paper's metrics. Training settings are left out.
-    """
+    """Ablation of the number of learned concepts (``column`` K) or of the guidance weight (omega), without training settings."""
     failures = [metric for metric in metrics(domain) if domain.less_is_better(metric)]
     papers = [number.metric for number in published(domain)]
     shown = [metric for metric in dict.fromkeys((domain.main_metric, *failures, *papers)) if metric in set(ours["metric"])]
@@ -284,11 +261,10 @@ def _components(domain: Domain, rows: pd.DataFrame, metric: str) -> Table:
 
 
 def points(domain: Domain, results: pd.DataFrame, axis: str) -> pd.DataFrame:
-    """The rows of a domain's headline, or else its main metric, along an axis of a curve.
-
-    The other column of :data:`AXES` and the guidance weight have the values with most points on the axis. Ties go to the weight of
-    the main tables for demonstrations, and to learned weights for K, as fixed weights per component would increase guidance with
-    K. Settings with the initial states of the demonstrations are left out: they have no more samples than demonstrations.
+    """The rows of a domain's headline, or else its main metric, along an axis of a curve. The other column of :data:`AXES` and the
+    guidance weight have the values with most points on the axis. Ties go to the weight of the main tables for demonstrations, and
+    to learned weights for K, as fixed weights per component would increase guidance with K. Settings with the initial states of the
+    demonstrations are left out: they have no more samples than demonstrations.
     """
     rows = latest(select(results, domain=domain.name, role=METHOD))
     rows = select(rows, metric=decisive(domain, rows))
@@ -316,10 +292,8 @@ def curves_table(domain: Domain, results: pd.DataFrame) -> Table:
 
 
 def changes_table(domain: Domain, results: pd.DataFrame) -> Table:
-    """Ablation of the changes to the paper's form: ours, and ours without a single change at a time.
-
-    There is a line for each variant in the order of the rows, and a column for each setting. The metric is the domain's headline or
-    else its main metric.
+    """Ablation of the changes to the paper's form: a line for ours, and for ours without a single change, by setting; decisive
+    metric.
     """
     rows = latest(select(results, domain=domain.name, role=METHOD))
     metric = decisive(domain, rows)

@@ -5,7 +5,7 @@ import os
 import socket
 import tempfile
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -18,30 +18,22 @@ from ftl_lightning.services import trust
 from ftl_lightning.services.errors import UserError, require, short
 from ftl_lightning.services.tensor_file import write_text
 
-POLL = 0.5
-"""Seconds between two checks of the cells."""
-LOOK = 5.0
-"""Seconds between two checks of the cluster."""
-HEAD_WAIT = 20.0
-"""Maximum seconds without an answer of the head; Ray ends the process after 60 without a useful message."""
-NODE_WAIT = 60.0
-"""Maximum seconds that a cell waits for a machine that has left the cluster."""
-MOST_RUNS = 2
-"""Maximum runs of a cell, so that a cell that crashes machines does not crash them all."""
+POLL = 0.5  #: Seconds between two checks of the cells.
+LOOK = 5.0  #: Seconds between two checks of the cluster.
+HEAD_WAIT = 20.0  #: Maximum seconds without an answer of the head; Ray ends the process after 60 without a useful message.
+NODE_WAIT = 60.0  #: Maximum seconds that a cell waits for a machine that has left the cluster.
+MOST_RUNS = 2  #: Maximum runs of a cell, so that a cell that crashes machines does not crash them all.
 
 
 @contextmanager
 def cluster(address: str, attempt: Attempt, cells: Sequence[Cell] = ()) -> Iterator[Run]:
-    """Connect to a Ray cluster for the length of the block; an existing connection is used and stays open.
+    """Connect to a Ray cluster for the length of the block; an existing connection is used and stays open. Raise UserError if Ray
+    is missing, no cluster answers, or a cell fits on no machine.
 
     Args:
-        address: ``'HOST:PORT'`` of the head; ``'auto'`` for the cluster of this machine; ``'local'`` for the processors of this
-            machine; empty for Ray's order: ``RAY_ADDRESS``, else a cluster on this machine, else its processors.
-        attempt: runs a cell on a machine of the cluster, in the current folder.
-        cells: cells to run.
-
-    Raises:
-        UserError: if Ray is missing, no cluster answers, or a cell fits on no machine.
+        address: ``'HOST:PORT'`` of the head; ``'auto'`` for this machine's cluster; ``'local'`` for its processors; empty for Ray's
+            order: ``RAY_ADDRESS``, else a cluster on this machine, else its processors.
+        attempt, cells: runs a cell on a machine of the cluster, in the current folder; and the cells to run.
     """
     try:
         import ray
@@ -51,7 +43,10 @@ def cluster(address: str, attempt: Attempt, cells: Sequence[Cell] = ()) -> Itera
     if started:
         _connect(address or os.environ.get("RAY_ADDRESS", ""))
     try:
-        _check_room(cells)
+        nodes = _nodes()
+        for cell in cells:
+            fits, expected = any(map(cell.resources.fit, nodes)), f"a machine with {cell.resources} in the cluster"
+            require(fits, f"resources: {cell}", expected, f"none among {len(nodes)}; lower them or add a machine")
         yield partial(_run, attempt)
     finally:
         if started:
@@ -78,10 +73,7 @@ def _connect(address: str) -> None:
 
 
 def _here() -> str:
-    """The address of this machine's cluster; empty for none.
-
-    Ray itself trusts the file with the address, and tries for minutes to reach a killed cluster.
-    """
+    """The address of this machine's cluster, or empty; Ray trusts the file, and tries for minutes to reach a killed cluster."""
     folder = os.environ.get("RAY_TMPDIR") or os.environ.get("TMPDIR") or "/tmp"
     file = Path(folder, "ray", "ray_current_cluster")
     try:
@@ -127,9 +119,9 @@ def _run(attempt: Attempt, cells: Sequence[Cell], known: set[str], tell: Tell) -
 
         def send(cell: Cell, runs: int) -> None:
             begun = Path(folder, str(next(numbers)))
-            task = remote.options(name=cell.folder, **cell.resources.ray())
-            sent = task.remote(str(Path.cwd()), cell, known, trust.vouched(), attempt, str(begun), runs > 1)
-            waiting[sent] = _Sent(cell, runs, begun)
+            remote_cell = remote.options(name=cell.folder, **cell.resources.ray())
+            task = remote_cell.remote(str(Path.cwd()), cell, known, trust.vouched(), attempt, str(begun), runs > 1)
+            waiting[task] = _Sent(cell, runs, begun)
 
         numbers = itertools.count()
         for cell in cells:
@@ -138,7 +130,10 @@ def _run(attempt: Attempt, cells: Sequence[Cell], known: set[str], tell: Tell) -
         while waiting:
             ready, _ = ray.wait(list(waiting), num_returns=1, timeout=POLL)
             now = time.monotonic()
-            _tell_begun(waiting.values(), tell)
+            for sent in waiting.values():
+                if not sent.node and sent.begun.is_file():
+                    sent.node = sent.begun.read_text("utf-8") or "?"
+                    tell(sent.cell, "running", sent.node, "")
             for task in ready:
                 ended = waiting.pop(task)
                 outcome, lost = _outcome(task)
@@ -162,34 +157,11 @@ def _run(attempt: Attempt, cells: Sequence[Cell], known: set[str], tell: Tell) -
                 )
 
 
-def _check_room(cells: Sequence[Cell]) -> None:
-    """Refuse cells that fit on no machine of the cluster and would wait for ever.
-
-    Raises:
-        UserError: naming the first such cell.
-    """
-    nodes = _nodes()
-    for cell in cells:
-        require(
-            any(cell.resources.fit(node) for node in nodes),
-            f"resources: {cell}",
-            f"a machine with {cell.resources} in the cluster",
-            f"none among {len(nodes)}; lower them or add a machine",
-        )
-
-
 def _nodes() -> list[dict[str, Any]]:
     """Resources of the cluster's nodes."""
     import ray
 
     return [node["Resources"] for node in ray.nodes() if node["Alive"]]
-
-
-def _tell_begun(waiting: Iterable[_Sent], tell: Tell) -> None:
-    for sent in waiting:
-        if not sent.node and sent.begun.is_file():
-            sent.node = sent.begun.read_text("utf-8") or "?"
-            tell(sent.cell, "running", sent.node, "")
 
 
 def _outcome(task: Any) -> tuple[Outcome, bool]:
@@ -224,7 +196,9 @@ def _attempt_in(
     folder: str, cell: Cell, known: set[str], vouched: frozenset[str], attempt: Attempt, begun: str, again: bool
 ) -> Outcome:
     """Run a cell in the shared folder of a cluster, with the modules that the user vouches for."""
-    node = _node_name()
+    import ray
+
+    node = f"{socket.gethostname()}/{ray.get_runtime_context().get_node_id()[:6]}"  # a machine may run several nodes
     if not Path(begun).parent.is_dir():
         message = f"{folder}: expected a folder that all machines share, found that {node} does not have it; call ablate in one"
         return Outcome(error=message, node=node)
@@ -233,10 +207,3 @@ def _attempt_in(
     write_text(begun, node)
     with trust.vouching(vouched):
         return replace(attempt(cell, known, again), node=node)
-
-
-def _node_name() -> str:
-    """Host name and the first letters of the node id, since a machine may run several nodes."""
-    import ray
-
-    return f"{socket.gethostname()}/{ray.get_runtime_context().get_node_id()[:6]}"

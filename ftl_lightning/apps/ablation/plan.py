@@ -12,8 +12,7 @@ from typing import Any, Literal
 
 from ftl_lightning.services.errors import UserError, require, short
 
-CPUS, GPUS, MEMORY = "cpus", "gpus", "memory_gb"
-"""Resources of every cluster; others are custom resources of Ray."""
+CPUS, GPUS, MEMORY = "cpus", "gpus", "memory_gb"  #: Resources of every cluster; others are custom resources of Ray.
 GIGABYTE = 10**9
 _NAME = re.compile(r"[A-Za-z][\w.-]{0,63}")
 
@@ -23,8 +22,7 @@ class Resources:
     """Resources of a cell.
 
     Attributes:
-        cpus: number of processors; whole, or a fraction below 1.
-        gpus: number of GPUs; likewise.
+        cpus, gpus: number of processors and of GPUs; whole, or a fraction below 1.
         memory_gb: gigabytes of 10^9 bytes; 0 for no request. Slurm enforces the limit, Ray does not.
         custom: custom resources of a Ray cluster by name, such as ``{'big': 1}`` of nodes started with it.
     """
@@ -36,11 +34,7 @@ class Resources:
 
     @classmethod
     def read(cls, amounts: Mapping[str, Any]) -> "Resources":
-        """Read resources from a configuration.
-
-        Raises:
-            UserError: for an invalid name or amount.
-        """
+        """Read resources from a configuration. Raise UserError for an invalid name or amount."""
         for name, amount in amounts.items():
             require(_NAME.fullmatch(name), "resources", f"{CPUS}, {GPUS}, {MEMORY} or a custom resource of the cluster", name)
             number = isinstance(amount, int | float) and not isinstance(amount, bool) and math.isfinite(amount) and amount >= 0
@@ -60,11 +54,7 @@ class Resources:
         return options | ({"resources": dict(self.custom)} if self.custom else {})
 
     def fit(self, node: Mapping[str, float]) -> bool:
-        """Whether an idle node of a Ray cluster has these resources.
-
-        Args:
-            node: its resources, in Ray's names (memory in bytes).
-        """
+        """Whether an idle ``node``, given by its resources in Ray's names (memory in bytes), has these resources."""
         needs = {"CPU": self.cpus, "GPU": self.gpus, "memory": self.memory_gb * GIGABYTE, **self.custom}
         return all(node.get(name, 0) >= amount for name, amount in needs.items())
 
@@ -113,13 +103,13 @@ class Stage:
         config: configuration file, or several files to merge in order.
         name: part of the cells' names, for stages that differ only in their options.
         each: lists of texts by name, for placeholders in other values; the stage runs for their product.
-        options: options of all cells, by their names on the command line.
-        grid: lists of values by option; the cells are their product.
-        done: file whose presence means that the stage need not run, such as a pretrained model; empty for none. Its content is
-            not checked: remove it after a change of the stage's configuration.
+        options, grid: options of all cells by their names on the command line, and lists of values, of whose product each cell has
+            one.
+        done: file whose presence means that the stage need not run; empty for none. Its content is not checked: remove it after a
+            change of the stage's configuration.
         seeds: subset of the ablation's seeds; empty for all.
-        resources: resources of each cell on a cluster: ``cpus`` (default 1), ``gpus``, ``memory_gb``, and any resource with which
-            the nodes of a Ray cluster were started.
+        resources: resources of each cell on a cluster: ``cpus`` (default 1), ``gpus``, ``memory_gb``, and custom resources of Ray's
+            nodes.
     """
 
     verb: Literal["fit", "invert"]
@@ -133,11 +123,7 @@ class Stage:
     resources: Mapping[str, float] = field(default_factory=dict)
 
     def cells(self, seed: int) -> Iterator[Cell]:
-        """The cells of a seed.
-
-        Raises:
-            UserError: without a configuration file, or for invalid resources.
-        """
+        """The cells of a seed. Raise UserError without a configuration file, or for invalid resources."""
         if self.seeds and seed not in self.seeds:
             return
         require(self.config, "config", "a configuration file or a list of them", "none")
@@ -165,11 +151,7 @@ def _filled(value: Any, names: Mapping[str, str]) -> str:
 
 
 def part(plan: Sequence[Sequence[Cell]], shard: str) -> list[list[Cell]]:
-    """Shard i of n (``'i/n'``) of a plan: every n-th cell, counted across stages.
-
-    Raises:
-        UserError: for an invalid shard.
-    """
+    """Shard i of n (``'i/n'``) of a plan: every n-th cell, counted across stages. Raise UserError for an invalid shard."""
     match = re.fullmatch(r"([1-9]\d*)/([1-9]\d*)", shard)
     if not match or int(match[1]) > int(match[2]):
         raise UserError(f"shard: expected 'number/shards' such as 3/8, found {short(shard)!r}")

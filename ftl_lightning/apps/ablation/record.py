@@ -32,14 +32,8 @@ State = Literal["queued", "running", "again", "done", "failed"]
 
 @dataclass(frozen=True)
 class Outcome:
-    """Outcome of a cell.
-
-    Attributes:
-        rows: rows of results, or ``None``.
-        note: a short note.
-        error: error of a failed cell, in one line.
-        seconds: duration; 0 if nothing was run.
-        node: the machine that ran the cell.
+    """Rows of a cell (or ``None``), a short note, the error of a failed cell in one line, seconds (0 if nothing was run), and
+    machine.
     """
 
     rows: "pd.DataFrame | None" = None
@@ -49,8 +43,7 @@ class Outcome:
     node: str = ""
 
 
-Tell = Callable[[Cell, State, str, str], None]
-"""Callback for a new state of a cell, with machine and note."""
+Tell = Callable[[Cell, State, str, str], None]  #: Callback for a new state of a cell, with machine and note.
 Run = Callable[[Sequence[Cell], set[str], Tell], Iterator[tuple[Cell, Outcome]]]
 """Runs cells, given the configuration hashes that need not run; yields each cell with its outcome."""
 Attempt = Callable[[Cell, set[str], bool], Outcome]
@@ -59,15 +52,8 @@ Attempt = Callable[[Cell, set[str], bool], Outcome]
 
 @dataclass(frozen=True)
 class CellRecord:
-    """Recorded state of a cell.
-
-    Attributes:
-        state: last reported state.
-        configs: configuration files of the cell.
-        node: last machine of the cell.
-        runs: number of attempts by the last command.
-        seconds: duration of the last complete run; 0 for none.
-        note: outcome, or the error.
+    """Recorded state of a cell, with configuration files, last machine, attempts by the last command, and outcome or error.
+    ``seconds`` is the duration of the last complete run; 0 for none.
     """
 
     state: State = "queued"
@@ -84,11 +70,7 @@ def record_path(results: str | Path) -> Path:
 
 
 def read_record(results: str | Path) -> dict[str, CellRecord]:
-    """Read the entries by cell name; empty if there is no file.
-
-    Raises:
-        UserError: for a damaged file.
-    """
+    """Read the entries by cell name; empty if there is no file. Raise UserError for a damaged file."""
     path = record_path(results)
     if not path.exists():
         return {}
@@ -101,10 +83,7 @@ def read_record(results: str | Path) -> dict[str, CellRecord]:
 
 
 def tell(results: str | Path, cells: Sequence[Cell], state: State, node: str = "", note: str = "", seconds: float = 0.0) -> None:
-    """Record a new state of cells, with machine, outcome or error, and duration; other processes are locked out.
-
-    An empty node and 0 seconds keep the known values.
-    """
+    """Record a state of cells; an empty node and 0 seconds keep the known values. Other processes are locked out."""
     path = record_path(results)
     with alone(path.parent):
         entries = read_record(results)
@@ -150,9 +129,8 @@ def by_node(entries: Mapping[str, CellRecord], cells: Sequence[Cell]) -> list[st
 
 
 def seconds_of(cell: Cell, entries: Mapping[str, CellRecord]) -> float | None:
-    """Measured seconds of a cell, or else the mean over similar cells; ``None`` without measurements.
-
-    Similar cells are, in order: the same cell with other seeds; cells of the same configuration files with other options.
+    """Measured seconds of a cell, or else the mean of the same cell with other seeds, or of the same files with other options, if
+    known.
     """
     measured = {name: entry for name, entry in entries.items() if entry.seconds}
     if cell.name in measured:
@@ -176,13 +154,8 @@ def makespan(seconds: Sequence[Sequence[float]], workers: int) -> float:
 
 
 def estimate(plan: Sequence[Sequence[Cell]], entries: Mapping[str, CellRecord], total: int, workers: int = 0) -> list[str]:
-    """Lines with the number of cells to run and the estimated hours, if known.
-
-    Args:
-        plan: the cells to run of each stage.
-        entries: entries of the record.
-        total: number of cells of the whole plan.
-        workers: number of parallel cells; 0 for the powers of two up to the number of cells.
+    """Lines with the number of cells to run and the estimated hours, if known, for some parallel ``workers`` (0 for the powers of
+    two up to the number of cells). ``plan`` has the cells to run of each stage; ``total`` counts all.
     """
     cells = [cell for stage in plan for cell in stage]
     lines = [f"{total} cells: {total - len(cells)} need not be run, {len(cells)} to run"]

@@ -15,18 +15,7 @@ from typing import TYPE_CHECKING, Literal
 
 from ftl_lightning.apps.ablation.cluster import cluster
 from ftl_lightning.apps.ablation.plan import Cell, Stage
-from ftl_lightning.apps.ablation.record import (
-    Outcome,
-    Run,
-    State,
-    Tell,
-    by_node,
-    count_states,
-    estimate,
-    read_record,
-    table,
-    tell,
-)
+from ftl_lightning.apps.ablation.record import Outcome, Run, State, Tell, by_node, count_states, estimate, read_record, table, tell
 from ftl_lightning.services import log_folder
 from ftl_lightning.services.configuration import load
 from ftl_lightning.services.errors import UserError, require
@@ -41,10 +30,8 @@ if TYPE_CHECKING:
 
 
 def check(cells: Sequence[Cell]) -> None:
-    """Check files, keys and encoder of each cell and, for ``invert``, domain, suites and model.
-
-    Raises:
-        UserError: all mistakes in one line; nothing was started.
+    """Check files, keys and encoder of each cell and, for ``invert``, domain, suites and model. Raise UserError with all mistakes
+    in one line; nothing was started.
     """
     made = {cell.options["model.output"] for cell in cells if cell.verb == "fit" and "model.output" in cell.options}
     mistakes = {}
@@ -95,19 +82,15 @@ def _check(cell: Cell, made: set[str]) -> None:
 def run_ablation(
     plan: Sequence[Sequence[Cell]], results: str, executor: Literal["local", "ray"] = "local", address: str = ""
 ) -> None:
-    """Run all cells, stage after stage. A failed cell does not stop the others; failures are listed at the end.
-
-    The state of each cell is recorded beside the results, see :mod:`~ftl_lightning.apps.ablation.record`.
+    """Run all cells, stage after stage, and record their states beside the results. A failed cell does not stop the others. Raise
+    UserError before the first run, for cells that cannot run; at the end, naming failed cells.
 
     Args:
         plan: cells of each stage, in order; a stage may read files of earlier stages.
         results: results file.
-        executor: ``'local'`` runs cells one by one in this process; ``'ray'`` runs cells in parallel on a cluster whose machines
-            share this folder. A cell that loses its process or machine runs once more.
+        executor: ``'local'`` runs cells one by one in this process; ``'ray'`` in parallel on a cluster whose machines share this
+            folder. A cell that loses its process or machine runs once more.
         address: address of the Ray cluster, see :func:`~ftl_lightning.apps.ablation.cluster.cluster`.
-
-    Raises:
-        UserError: before the first run, for cells that cannot run; at the end, naming failed cells.
     """
     from ftl_lightning.evaluation.results import add_rows
 
@@ -233,12 +216,8 @@ def _one_after_another(cells: Sequence[Cell], known: set[str], tell: Tell) -> It
 
 
 def attempt(cell: Cell, known: set[str], again: bool = False) -> Outcome:
-    """Run a cell, unless its results are known; any error becomes its outcome.
-
-    Args:
-        cell: the cell.
-        known: configuration hashes that need not run.
-        again: whether the cell was lost before; pretraining then resumes from its last checkpoint, if any.
+    """Run a cell, unless its configuration hash is known; any error becomes its outcome. Pretraining that was lost before
+    (``again``) resumes from its last checkpoint, if any.
     """
     if _is_made(cell):
         return Outcome(note="done before")

@@ -15,14 +15,11 @@ from ftl_lightning.services import trust
 from ftl_lightning.services.errors import UserError, require, shown
 from ftl_lightning.services.tensor_file import write_text
 
-MOST_JOBS = 1000
-"""Maximum jobs of an array by Slurm's default."""
-RESERVED = ("array", "ntasks", "wrap")
-"""Options of sbatch that the scripts set."""
+MOST_JOBS = 1000  #: Maximum jobs of an array by Slurm's default.
+RESERVED = ("array", "ntasks", "wrap")  #: Options of sbatch that the scripts set.
 _CPUS = "cpus-per-task"
 _OPTION = re.compile(r"[a-z][a-z-]{0,39}")
-_VALUE = re.compile(r"[\w.,:/@%+=\[\]*-]{0,200}")
-"""Values of options: no characters that end a line or begin another word."""
+_VALUE = re.compile(r"[\w.,:/@%+=\[\]*-]{0,200}")  #: Values of options: no characters that end a line or begin another word.
 
 
 @dataclass(frozen=True)
@@ -37,11 +34,7 @@ class Wave:
 
 
 def waves(plan: Mapping[int, Sequence[Cell]]) -> list[Wave]:
-    """Group stages: a group begins when a cell reads an output of the previous group, such as a pretrained model.
-
-    Args:
-        plan: the cells of each stage by its number, in order.
-    """
+    """Group stages by number: a group begins when a cell reads an output of the previous group, such as a pretrained model."""
     groups: list[list[int]] = []
     made: set[str] = set()
     for number, cells in plan.items():
@@ -60,12 +53,10 @@ def _reads(cell: Cell, made: set[str]) -> bool:
 
 
 def script(wave: Wave, plan: Path, folder: Path, jobs: int = 0, options: Mapping[str, str] = {}) -> str:
-    """Script of an array, in which each job runs a shard of the cells.
+    """Script of an array, in which each job runs a shard of the cells of a wave.
 
     Args:
-        wave: a wave of the plan.
-        plan: the plan's configuration file.
-        folder: working folder of the jobs, shared by all machines.
+        plan, folder: the plan's configuration file, and the working folder of the jobs; all machines share both.
         jobs: number of jobs; 0 for a job per cell, at most :data:`MOST_JOBS`.
         options: options of sbatch by name; empty values for flags. Options that sbatch could misread are refused.
     """
@@ -115,17 +106,14 @@ def write_scripts(
     jobs: int = 0,
     options: Mapping[str, str] = {},
 ) -> list[str]:
-    """Write the scripts of a grid, and a copy of its plan, so that waiting jobs do not see later changes.
+    """Write the scripts of a grid, and a copy of its plan, so that waiting jobs do not see later changes; return the submit
+    commands.
 
     Args:
         file: output file ``grid.sh``; with several waves ``grid.1.sh``, ``grid.2.sh``. The plan is ``grid.sh.yaml``.
-        stages: stages of the plan.
-        plan: the cells of each stage by its number.
+        stages, plan: stages of the plan, and the cells of each by its number.
         keys: keys of the plan's file beside the stages: results, seeds, root.
         jobs, options: as in :func:`script`.
-
-    Returns:
-        The submit commands, in order.
     """
     file, folder = Path(file), Path.cwd()
     written = folder / f"{file}.yaml"

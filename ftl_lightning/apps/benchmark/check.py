@@ -19,23 +19,15 @@ from ftl_lightning.training.method import code_hash, load_method
 from ftl_lightning.version import __version__
 
 HASH = re.compile(r"[0-9a-f]{16}")
-NAME = re.compile(r"[\w .+()-]{1,60}")
-"""Allowed names of methods."""
-ROUNDING = 2e-6
-"""Tolerance for values rounded to six decimals."""
-ERRORS = 3
-"""Tolerance of rates in standard errors on another machine, where learning amplifies rounding."""
+NAME = re.compile(r"[\w .+()-]{1,60}")  # allowed names of methods
+ROUNDING = 2e-6  # tolerance for values rounded to six decimals
+ERRORS = 3  # tolerance of rates in standard errors on another machine, where learning amplifies rounding
 MOST_REFERENCES = 20
 
 
 def check_submission(path: Path) -> tuple[Submission, dict[str, BenchmarkSuite]]:
-    """Read a submission, and check its completeness and its agreement with itself and the frozen suites.
-
-    Returns:
-        The submission, and its suites by name.
-
-    Raises:
-        UserError: naming the file and the first error.
+    """Read a submission with its suites by name, and check its completeness and its agreement with itself and the frozen suites.
+    Raise UserError naming the file and the first error.
     """
     submission = Submission.load(path)
     with about(path):
@@ -125,10 +117,8 @@ def _check_scores(submission: Submission) -> None:
 
 
 def drawn(submission: Submission, share: float, salt: str) -> list[Run]:
-    """Draw the runs to run again, with at least a share of all rows.
-
-    The draw depends on a hash of the file and a word of the checker, ``salt``: who does not know the word cannot tune a file to a
-    favourable draw.
+    """Draw the runs to run again, with at least a share of all rows. The draw depends on the file and a word, ``salt``: who does
+    not know the word cannot tune a file to a favourable draw.
     """
     file_hash = submission.hash
     order = sorted(submission.runs, key=lambda run: content_hash([salt, file_hash, run.suite, run.seed]))
@@ -140,13 +130,8 @@ def drawn(submission: Submission, share: float, salt: str) -> list[Run]:
 
 
 def allowed(submitted: float, repeated: float, n: int, rate: bool, alike: bool) -> bool:
-    """Whether a number was reproduced: exactly on a machine of the same kind, else approximately.
-
-    Args:
-        submitted, repeated: the numbers.
-        n: number of samples.
-        rate: whether the numbers are fractions of the samples; other numbers may differ by a fifth on another machine.
-        alike: whether processor, versions and threads are the same.
+    """Whether a number was reproduced: exactly on an alike machine (same processor, versions and threads), else approximately. A
+    rate is a fraction of ``n`` samples; other numbers may differ by a fifth on another machine.
     """
     difference = abs(submitted - repeated)
     if alike or difference <= ROUNDING:
@@ -184,11 +169,7 @@ def differences(run: Run, again: Run, suite: BenchmarkSuite, alike: bool) -> Ite
 def recompute(
     candidate: Candidate, submission: Submission, suites: Mapping[str, BenchmarkSuite], share: float, salt: str
 ) -> list[str]:
-    """Run a part of a submission again and return the differences.
-
-    Raises:
-        UserError: for another method, or one that cannot be run here.
-    """
+    """Run a part of a submission again; return the differences. Raise UserError for a method that is another or missing."""
     method = load_method(candidate.method)
     expected = f"{submission.method!r}, the method of the submission"
     require(method.name == submission.name, "method", expected, repr(candidate.method))

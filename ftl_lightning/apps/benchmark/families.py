@@ -22,13 +22,10 @@ from ftl_lightning.domains.domain import ACCURACY, Concepts, Domain, Generated, 
 from ftl_lightning.domains.tasks import EvaluationTask, Suite, training_suite
 from ftl_lightning.services.randomness import FRESH_SEED
 
-TEMPLATES, TEMPLATE_SEED = 80, 7_000_000
-"""Number of templates per kind, and their reserved seed."""
+TEMPLATES, TEMPLATE_SEED = 80, 7_000_000  # number of templates per kind, and their reserved seed
 CHANCE, ORACLE = "random kind (chance)", "generator (oracle)"
-Draw = Callable[[str, int, int], NDArray[np.float32]]
-"""``(kind, count, seed) -> (count, time, column)``."""
-Kind = Callable[[NDArray[np.float32]], Sequence[str]]
-"""``(samples (sample, time, column)) -> kind of each sample``."""
+Draw = Callable[[str, int, int], NDArray[np.float32]]  # ``(kind, count, seed) -> (count, time, column)``
+Kind = Callable[[NDArray[np.float32]], Sequence[str]]  # ``(samples (sample, time, column)) -> kind of each sample``
 
 
 def _rng(*words: object) -> np.random.Generator:
@@ -40,10 +37,9 @@ def _number(kind: str) -> int:
 
 
 def pictures(kind: str, count: int, seed: int) -> NDArray[np.float32]:
-    """Pictures of polylines with three to five corners, drawn with a soft pen: ``(count, 1, 64)``.
-
-    A state has 8 x 8 grey values from 0 to 16, row by row. The kind ``'picture NUMBER'`` determines the corners, the seed slant,
-    size, place and width of each picture.
+    """Pictures of polylines with three to five corners, drawn with a soft pen: ``(count, 1, 64)``. A state has 8 x 8 grey values
+    from 0 to 16, row by row. The kind ``'picture NUMBER'`` determines the corners, the seed slant, size, place and width of each
+    picture.
     """
     rng, shape = _rng("pictures", kind, seed), _rng("picture", _number(kind))
     corner = shape.uniform(0.12, 0.88, (int(shape.integers(3, 6)), 2))
@@ -65,10 +61,9 @@ def pictures(kind: str, count: int, seed: int) -> NDArray[np.float32]:
 
 
 def reaches(kind: str, count: int, seed: int) -> NDArray[np.float32]:
-    """Reaches of a hand through three places, with a gripper that closes on the way: ``(count, 50, 4)``.
-
-    Columns are x, y and z in metres, mostly within 0.6 of the origin, and the opening from 0 to 80 mm. The kind ``'reach NUMBER'``
-    determines the places and when the gripper closes, the seed start and deviations of each reach.
+    """Reaches of a hand through three places, with a gripper that closes on the way: ``(count, 50, 4)``. Columns are x, y and z in
+    metres, mostly within 0.6 of the origin, and the opening from 0 to 80 mm. The kind ``'reach NUMBER'`` determines the places and
+    when the gripper closes, the seed start and deviations of each reach.
     """
     shape, rng, s, drawn = _rng("a reach", _number(kind)), _rng("reaches", kind, seed), np.linspace(0, 1, 50), []
     goals, closing, height = shape.uniform(-0.4, 0.4, (3, 3)), shape.uniform(0.2, 0.8), shape.uniform(0.05, 0.3)
@@ -85,9 +80,8 @@ def reaches(kind: str, count: int, seed: int) -> NDArray[np.float32]:
 
 
 def beats(kind: str, count: int, seed: int) -> NDArray[np.float32]:
-    """Beats of one column, four waves over a wandering line: ``(count, 120, 1)``, in millivolts, mostly within 3 of zero.
-
-    The kind ``'beat NUMBER'`` determines the waves, the seed pace, size and wandering of each beat.
+    """Beats of one column, four waves over a wandering line: ``(count, 120, 1)``, in millivolts, mostly within 3 of zero. The kind
+    ``'beat NUMBER'`` determines the waves, the seed pace, size and wandering of each beat.
     """
     shape, rng, s, drawn = _rng("a beat", _number(kind)), _rng("beats", kind, seed), np.linspace(0, 1, 120), []
     place, width, height = np.sort(shape.uniform(0.1, 0.9, 4)), shape.uniform(0.015, 0.08, 4), shape.normal(0, 1, 4)
@@ -101,12 +95,7 @@ def beats(kind: str, count: int, seed: int) -> NDArray[np.float32]:
 
 @dataclass(frozen=True)
 class Nearest:
-    """Classify samples by the nearest template; columns are scaled by their spread.
-
-    Attributes:
-        draw: draws templates.
-        kinds: known kinds.
-    """
+    """Classify samples by the nearest template of known kinds; columns are scaled by their spread."""
 
     draw: Draw
     kinds: tuple[str, ...]

@@ -39,11 +39,7 @@ def suite_table() -> str:
 
 
 def read_submissions(folder: Path) -> list[Submission]:
-    """Read and check the submissions of a folder, sorted by name.
-
-    Raises:
-        UserError: for the first invalid file, two submissions of a method, or a folder without submissions.
-    """
+    """Submissions of a folder by name. Raise UserError for an invalid file, two submissions of a method, or an empty folder."""
     files = visible(folder, "*.json") if folder.is_dir() else []
     require(files, str(folder), "a folder of submissions (.json)", "none")
     known: dict[str, Submission] = {}

@@ -27,24 +27,18 @@ from ftl_lightning.training.model_config import CONFIG
 if TYPE_CHECKING:
     import pandas as pd
 
-SHIPPED = "shipped"
-"""Value of ``model`` for the models that the method's configurations name."""
-CONFIGURATIONS = Path(__file__).parent / "configurations"
-"""Configurations of the package's methods for the families."""
+SHIPPED = "shipped"  # value of ``model`` for the models that the method's configurations name
+CONFIGURATIONS = Path(__file__).parent / "configurations"  # configurations of the package's methods for the families
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """Method with its models and configurations.
+    """Method, by its registered name, with its models and configurations.
 
     Attributes:
-        method: registered name of the method.
-        model: folder of the pretrained models, with placeholders ``{suite}`` and ``{seed}``; :data:`SHIPPED`; or empty to
-            pretrain.
-        configurations: folder with ``SUITE.yaml`` for each suite, or ``suites.yaml`` for all others; empty for those of the
-            method's package.
-        root: folder of the user's recordings; ``None`` for none.
-        work: folder for models and logs.
+        model: folder of the pretrained models, with placeholders ``{suite}`` and ``{seed}``; :data:`SHIPPED`; or empty to pretrain.
+        configurations: folder with ``SUITE.yaml`` for each suite, or ``suites.yaml``; empty for those of the method's package.
+        root, work: folders of the user's recordings (``None`` for none), and for models and logs.
     """
 
     method: str
@@ -59,11 +53,7 @@ class Candidate:
         return load_method(self.method)
 
     def configuration(self, suite: BenchmarkSuite) -> Path:
-        """The file that configures ``fit`` and ``invert`` for a suite; written if the method has none.
-
-        Raises:
-            UserError: for a folder without such a file.
-        """
+        """The file that configures a suite; written if the method has none. Raise UserError for a folder without such a file."""
         folder = self.configurations or self.declared.configurations
         places = [Path(folder) / f"{suite.name}.yaml", Path(folder) / "suites.yaml"] if folder else []
         places += [] if self.configurations else [CONFIGURATIONS / f"{self.method}.yaml"]
@@ -74,11 +64,7 @@ class Candidate:
         return self._written(suite)
 
     def configurations_of(self, suite: BenchmarkSuite) -> tuple[str, ...]:
-        """The configuration files of a suite, in the order of merging.
-
-        Raises:
-            UserError: if no file names the method's adaptation class.
-        """
+        """The suite's configuration files, in order of merging. Raise UserError if none names the method's adaptation class."""
         path, added = self.configuration(suite), shipped(f"conf/method/{self.method}.yaml")
         expected = adaptation_of(self.declared).__name__
         for files in ((path,), (path, added)):
@@ -103,11 +89,7 @@ class Candidate:
         return path
 
     def trained(self, suite: BenchmarkSuite, seed: int) -> Path:
-        """Folder of the model of a suite and a seed.
-
-        Raises:
-            UserError: if a given model is missing.
-        """
+        """Folder of the model of a suite and a seed. Raise UserError if a given model is missing."""
         if not self.model:
             return self.work / "models" / f"{suite.name}-seed{seed}"
         if self.model == SHIPPED:
@@ -158,11 +140,7 @@ class Candidate:
         return pretraining, Cell("invert", files, shared | invert, "", f"invert {name}")
 
     def run(self, suite: BenchmarkSuite, seed: int) -> Run:
-        """Run a suite with a seed.
-
-        Raises:
-            UserError: if the data differ from the frozen data, or the method cannot be run.
-        """
+        """Run a suite with a seed. Raise UserError if the data differ from the frozen data, or the method cannot be run."""
         parts = REQUIRED if self.model else (TRAINING, *REQUIRED)
         if not suite.check_data(seed, self.root, parts):
             say(f"note: suite {suite.name}, seed {seed}: this processor rounds the data in another way", error=True)
@@ -196,11 +174,7 @@ class Candidate:
 
 
 def _rows(suite: BenchmarkSuite, table: "pd.DataFrame", *needed: str) -> list[Row]:
-    """Rows of the test's concepts; of the suite's measures only ``needed`` are required, by default all.
-
-    Raises:
-        UserError: naming the missing concept and measure.
-    """
+    """Rows of the test's concepts. Raise UserError for a missing measure of those ``needed``, by default all of the suite."""
     rows = []
     for task in suite.test:
         group = table[(table["setting"] == task.setting) & (table["task"] == task.concept)]
@@ -215,10 +189,8 @@ def _rows(suite: BenchmarkSuite, table: "pd.DataFrame", *needed: str) -> list[Ro
 
 
 def run_benchmark(candidate: Candidate, begun: Submission, names: Sequence[str], out: Path) -> Submission:
-    """Run the missing suites and seeds of a submission; the file is written after each run.
-
-    Raises:
-        UserError: at the end, with the first failed suite and seed; completed runs are in the file.
+    """Run missing suites and seeds, and write the file after each. Raise UserError at the end, with the first failed suite and
+    seed.
     """
     submission = begun
     failed: list[str] = []

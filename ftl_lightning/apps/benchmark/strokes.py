@@ -14,17 +14,12 @@ from numpy.typing import NDArray
 
 from ftl_lightning.services.randomness import task_key
 
-STEPS = 40
-"""Number of points of a stroke."""
-TEMPLATES, TEMPLATE_SEED = 100, 5_000_000
-"""Number of templates per kind of :class:`Judge`, and their reserved seed."""
-RANDOM = "scribble"
-"""Kind without a common form: smooth curves and polylines through random corners."""
-MIRRORED, BACKWARDS = "mirrored ", "backwards "
-"""Prefixes of kinds that are mirrored left to right, or drawn from end to start."""
+STEPS = 40  #: Number of points of a stroke.
+TEMPLATES, TEMPLATE_SEED = 100, 5_000_000  #: Number of templates per kind of :class:`Judge`, and their reserved seed.
+RANDOM = "scribble"  #: Kind without a common form: smooth curves and polylines through random corners.
+MIRRORED, BACKWARDS = "mirrored ", "backwards "  #: Prefixes of kinds that are mirrored left to right, or drawn from end to start.
 
-Points = NDArray[np.float64]
-"""``(..., 2)``."""
+Points = NDArray[np.float64]  #: ``(..., 2)``.
 Shape = Callable[[Points], Points]
 """Path within about 1 of the origin: points ``(..., 2)`` at shares ``(...,)`` of the stroke, from 0 to 1."""
 
@@ -159,16 +154,11 @@ _TEST: dict[str, Shape] = {
 _CLOSED_KINDS = {"circle", "triangle", "figure eight", "square", "heart", *_CLOSED, "diamond", "drop", "hourglass"}
 _CLOSED_KINDS |= {"star", "house", "pentagon", "infinity"}
 """Closed strokes, which may begin slightly early or late and end before or beyond their beginning."""
-NEW = ("square", "heart", "S-curve")
-"""New kinds of :func:`strokes`."""
-TRAINING = tuple(kind for kind in SHAPES if kind not in NEW)
-"""Pretraining kinds of :func:`strokes`."""
-KNOWN = (*TRAINING, *_OPEN, *_CLOSED)
-"""Pretraining kinds of :func:`drawn`."""
-VALIDATION = (*NEW, *_VALIDATION)
-"""New kinds of :func:`drawn` for model selection."""
-TEST = tuple(_TEST)
-"""New kinds of :func:`drawn` for the final evaluation, used once."""
+NEW = ("square", "heart", "S-curve")  #: New kinds of :func:`strokes`.
+TRAINING = tuple(kind for kind in SHAPES if kind not in NEW)  #: Pretraining kinds of :func:`strokes`.
+KNOWN = (*TRAINING, *_OPEN, *_CLOSED)  #: Pretraining kinds of :func:`drawn`.
+VALIDATION = (*NEW, *_VALIDATION)  #: New kinds of :func:`drawn` for model selection.
+TEST = tuple(_TEST)  #: New kinds of :func:`drawn` for the final evaluation, used once.
 _SHAPES = SHAPES | _OPEN | _CLOSED | _VALIDATION | _TEST
 
 
@@ -177,8 +167,7 @@ def strokes(kind: str, count: int, seed: int) -> NDArray[np.float32]:
 
     Args:
         kind: one of :data:`TRAINING` or :data:`NEW`.
-        count: number of strokes.
-        seed: random seed; strokes are equal on every machine up to rounding.
+        count, seed: number of strokes, and random seed; strokes are equal on every machine up to rounding.
 
     Returns:
         ``(count, 40, 2)``, x and y, in centimetres, mostly within 4 of the origin.
@@ -212,18 +201,13 @@ def _scribbles(even: Points, rng: np.random.Generator) -> Points:
 
 
 def drawn(kind: str, count: int, seed: int, alike: float = 0.0) -> NDArray[np.float32]:
-    """Hand-drawn strokes of one kind.
+    """Hand-drawn strokes of one kind, as of :func:`strokes`: ``(count, 40, 2)``.
 
     Args:
         kind: one of :data:`KNOWN`, :data:`VALIDATION` or :data:`TEST`, also after :data:`MIRRORED` or :data:`BACKWARDS`; or
             :data:`RANDOM`.
-        count: number of strokes.
-        seed: random seed; strokes are equal on every machine up to rounding.
         alike: 0 for strokes of many people, all over the canvas; up to 1 for one person's strokes at the same place, which differ
             in bending and trembling.
-
-    Returns:
-        ``(count, 40, 2)``, x and y, in centimetres, mostly within 4 of the origin.
     """
     rng = np.random.default_rng([seed, task_key(kind)])
     plain = kind.removeprefix(MIRRORED).removeprefix(BACKWARDS)
@@ -272,12 +256,7 @@ def _normalised(points: NDArray[np.float32]) -> Points:
 
 @dataclass(frozen=True)
 class Judge:
-    """Classifier of strokes by the nearest template, invariant to place and size.
-
-    Attributes:
-        kinds: known kinds.
-        templates: normalised ``(kind * template, 80)``.
-    """
+    """Classifier of strokes by the nearest of normalised templates ``(kind * template, 80)``, invariant to place and size."""
 
     kinds: tuple[str, ...]
     templates: Points

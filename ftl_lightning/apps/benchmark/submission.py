@@ -16,21 +16,13 @@ from ftl_lightning.services.validation import from_mapping, read_json
 from ftl_lightning.version import __version__
 
 KIND, FORMAT = "few-shot concepts", 1
-MOST = 4 * 2**20
-"""Maximum size of a file in bytes; nine suites with three seeds need a twentieth."""
-PRETRAINED, GIVEN = "pretrained", "given"
-"""Origins of a model: pretrained in the run, or given."""
+MOST = 4 * 2**20  # maximum size of a file in bytes; nine suites with three seeds need a twentieth
+PRETRAINED, GIVEN = "pretrained", "given"  # origins of a model: pretrained in the run, or given
 
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """Measurements of a concept.
-
-    Attributes:
-        setting, concept: the test task.
-        n: number of samples or episodes.
-        measures: values by name, rounded to six decimals.
-    """
+    """Measurements of a test task: ``n`` samples or episodes, and values by name, rounded to six decimals."""
 
     setting: str
     concept: str
@@ -43,14 +35,12 @@ class Run:
     """Run of a suite with a seed.
 
     Attributes:
-        suite, seed: suite and seed.
-        model: hash of the pretrained model.
+        model, configuration: hashes of the pretrained model, and of the whole configuration.
         origin: ``pretrained`` in this run, or ``given``.
         data: hashes of the drawn data, by part.
-        configuration: hash of the whole configuration.
         pretraining_seconds, seconds: duration of pretraining (0 for a given model), and of learning with evaluation.
-        rows: rows of the method, one for each concept of the test.
-        references: rows of the reference policies by name, if the suite has them.
+        rows, references: a row for each concept of the test, of the method and of reference policies by name, if the suite has
+            them.
     """
 
     suite: str
@@ -67,13 +57,7 @@ class Run:
 
 @dataclass(frozen=True, kw_only=True)
 class Score:
-    """Score of a suite: its first measure, averaged over seeds, then over concepts.
-
-    Attributes:
-        mean: mean over concepts.
-        error: standard error of the mean over concepts; 0 for a single concept.
-        concepts: number of concepts.
-    """
+    """Mean over concepts of a suite's first measure, averaged over seeds, with standard error, 0 for a single concept."""
 
     mean: float
     error: float
@@ -85,16 +69,11 @@ class Submission:
     """Results of a method.
 
     Attributes:
-        kind, format: kind and format of the file.
-        method: registered name of the method.
-        name: name in tables.
+        method, name: registered name of the method, and name in tables.
         code: hash of the package with the method; empty for methods of ftl-lightning.
-        version: version of ftl-lightning.
-        machine: description of the machine.
-        seeds: seeds of every suite.
-        suites: hashes of the suites' definitions by name.
-        runs: one for each suite and seed.
-        scores: scores of complete suites.
+        version, machine: version of ftl-lightning, and description of the machine.
+        seeds, suites: seeds of every suite, and hashes of the suites' definitions by name.
+        runs, scores: a run for each suite and seed, and scores of complete suites.
     """
 
     kind: str = KIND
@@ -124,11 +103,7 @@ class Submission:
 
     @classmethod
     def load(cls, path: Path) -> "Submission":
-        """Read a file; nothing that it names is imported or opened.
-
-        Raises:
-            UserError: for an invalid file, naming file and key.
-        """
+        """Read a file; nothing that it names is imported or opened. Raise UserError for an invalid file, naming file and key."""
         check_readable(path, "submission", MOST)
         with about(path):
             return from_mapping(cls, read_json(path, "a submission"), "")

@@ -21,18 +21,12 @@ from ftl_lightning.version import __version__
 FOLDER = Path(__file__).parent / "suites"
 FAMILIES = {name: f"{__package__}.families:{name.upper()}" for name in ("beats", "pictures", "reaches", "strokes")}
 """References ``module:ATTRIBUTE`` of the benchmark's domains by short name: suites' files, which are hashed, name no module."""
-SEEDS = (0, 1, 2)
-"""Seeds of the protocol."""
-TOLERANCE = 1e-3
-"""Maximum relative difference of mean and mean square that is due to rounding on another processor."""
-TRAINING, DEMONSTRATIONS, VALIDATION, STARTS = "training", "demonstrations", "validation", "starts"
-"""Parts of a suite's data."""
-REQUIRED = (DEMONSTRATIONS, STARTS)
-"""Parts that every run draws, also without pretraining."""
-EXPORTED = (TRAINING, VALIDATION, DEMONSTRATIONS)
-"""Parts that :func:`write_data` writes."""
-FORMATS = ("npz", "safetensors", "lerobot", "minari")
-"""Formats of exported data."""
+SEEDS = (0, 1, 2)  # seeds of the protocol
+TOLERANCE = 1e-3  # maximum relative difference of mean and mean square that is due to rounding on another processor
+TRAINING, DEMONSTRATIONS, VALIDATION, STARTS = "training", "demonstrations", "validation", "starts"  # parts of a suite's data
+REQUIRED = (DEMONSTRATIONS, STARTS)  # parts that every run draws, also without pretraining
+EXPORTED = (TRAINING, VALIDATION, DEMONSTRATIONS)  # parts that :func:`write_data` writes
+FORMATS = ("npz", "safetensors", "lerobot", "minari")  # formats of exported data
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,12 +39,8 @@ class Task:
 
 @dataclass(frozen=True, kw_only=True)
 class Training:
-    """Pretraining data.
-
-    Attributes:
-        concepts: texts of the concepts.
-        count: demonstrations per concept.
-        recoveries: maximum number of additional demonstrations per concept, which start from failures.
+    """Pretraining data: texts of concepts, demonstrations of each, and up to ``recoveries`` more of each, which start from
+    failures.
     """
 
     concepts: Sequence[str]
@@ -83,17 +73,12 @@ class BenchmarkSuite:
     """Frozen suite.
 
     Attributes:
-        name: name of its file.
-        title: title in words.
         domain: short name in :data:`FAMILIES`, name of a registered domain, or ``module:ATTRIBUTE``.
         needs: extra with the simulator; empty for none.
         recordings: whether data are read from the user's copy.
-        training: pretraining data.
-        validation: concepts on which a method may be tuned.
-        test: test tasks, never tuned on.
+        validation, test: concepts on which a method may be tuned, and test tasks, never tuned on.
         test_suite: name of the test suite in the domain.
-        demonstrations: demonstrations per new concept.
-        samples: samples or episodes per concept.
+        demonstrations, samples: demonstrations per new concept, and samples or episodes per concept.
         closed_loop: whether plans are executed.
         references: whether reference policies are measured, too; some are slow.
         measures: kind of each measure by name: a ``rate`` of right samples, or an ``error rate`` or a ``distance``, for which less
@@ -137,11 +122,7 @@ class BenchmarkSuite:
         return FAMILIES.get(self.domain, self.domain)
 
     def loaded(self) -> Domain:
-        """Load the domain, and check that it has the concepts of the suite.
-
-        Raises:
-            UserError: for another version of the domain, or a missing simulator.
-        """
+        """The domain. Raise UserError if it lacks the suite's concepts, as in another version, or its simulator is missing."""
         domain = load_domain(self.domain_reference)
         with about(f"suite {self.name}"):
             tasks = {(task.setting, task.name) for task in domain.concepts.suites[self.test_suite].tasks}
@@ -181,13 +162,8 @@ class BenchmarkSuite:
         return concatenate([source.draw(concept, self.demonstrations, DEMONSTRATION_SEED + seed) for concept in concepts])
 
     def check_data(self, seed: int, root: Path | None, parts: Sequence[str]) -> bool:
-        """Compare data with the frozen suite. Parts without a fingerprint are skipped.
-
-        Returns:
-            Whether the data are bit-identical; else they differ by rounding.
-
-        Raises:
-            UserError: for other data, with suite, seed, part and both hashes.
+        """Whether data are bit-identical to the frozen suite, or differ by rounding; parts without a fingerprint are skipped. Raise
+        UserError for other data, with suite, seed, part and both hashes.
         """
         known = self.data.get(str(seed), {})
         drawn = self.fingerprints(seed, root, [part for part in parts if part in known])
@@ -207,11 +183,7 @@ def suite_names() -> tuple[str, ...]:
 
 
 def load_suite(name: str) -> BenchmarkSuite:
-    """Load a suite.
-
-    Raises:
-        UserError: for an unknown name or a damaged file.
-    """
+    """Load a suite. Raise UserError for an unknown name or a damaged file."""
     names = suite_names()
     require(name in names, "suites", f"some of {', '.join(names)}", short(name))
     path = FOLDER / f"{name}.json"
@@ -220,17 +192,8 @@ def load_suite(name: str) -> BenchmarkSuite:
 
 
 def write_data(suite: BenchmarkSuite, seeds: Sequence[int], folder: Path, form: str, root: Path | None) -> list[Path]:
-    """Write training pairs, and demonstrations for tuning and test, with ``README.md`` and ``hashes.json``.
-
-    Args:
-        suite: the suite.
-        seeds: seeds of the data.
-        folder: parent of the output folder, which has the suite's name.
-        form: format of :data:`FORMATS`. Minari's data sets go to Minari's folder, under ``benchmark/SUITE-PART-seedN-v0``.
-        root: folder of the user's copy of the data.
-
-    Returns:
-        Written files, without Minari's data sets.
+    """Write training pairs, and demonstrations for tuning and test, with ``README.md`` and ``hashes.json``, to a subfolder of
+    ``folder``. Minari's data sets go to Minari's folder, under ``benchmark/SUITE-PART-seedN-v0``. Returns the files.
     """
     require(form in FORMATS, "format", f"one of {', '.join(FORMATS)}", form)
     place, known = folder / suite.name, {}

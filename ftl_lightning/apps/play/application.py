@@ -20,12 +20,9 @@ from ftl_lightning.apps.play.workspace import Stopped, Workspace, title_of
 from ftl_lightning.services.errors import require, short
 from ftl_lightning.services.validation import from_mapping, parse_json
 
-MOST_BODY, MOST_FILE = 4 * 2**20, 64 * 2**20
-"""Maximum bytes of a request, and of an uploaded file."""
-MOST_WAITING = 32
-"""Maximum number of pending requests; further requests are refused."""
-WAIT = 0.5
-"""Seconds between checks whether the client still waits for learning."""
+MOST_BODY, MOST_FILE = 4 * 2**20, 64 * 2**20  # maximum bytes of a request, and of an uploaded file
+MOST_WAITING = 32  # maximum number of pending requests; further requests are refused
+WAIT = 0.5  # seconds between checks whether the client still waits for learning
 SERVED = "; connect-src 'self'; frame-ancestors 'none'"
 """Addition to the policy of every page: a served page may send requests to this server."""
 
@@ -40,10 +37,7 @@ ANSWERS: Mapping[str, Handler] = {
     "sample": (requests.Sample, Workspace.sample),
 }
 """Type of the JSON body and handler of requests that are answered by the handler's result."""
-CHANGES: Mapping[str, Handler] = {
-    "forget": (requests.Named, Workspace.forget),
-    "rename": (requests.Renamed, Workspace.rename),
-}
+CHANGES: Mapping[str, Handler] = {"forget": (requests.Named, Workspace.forget), "rename": (requests.Renamed, Workspace.rename)}
 """The same of requests that are answered by the whole state of the page."""
 
 
@@ -51,8 +45,8 @@ class Desk:
     """Workspaces of the opened models. Requests are handled in the current workspace, one at a time.
 
     Args:
-        models: names of models that can be opened; the first is the initial model.
-        make: creates the workspace of a model; called in a thread.
+        models, make: names of models that can be opened, the initial model first; and creates the workspace of a model, in a
+            thread.
     """
 
     def __init__(self, models: Sequence[str], make: Callable[[str], Workspace]) -> None:
@@ -63,11 +57,7 @@ class Desk:
         self.ended = threading.Event()
 
     async def work(self, do: Callable[[Workspace], Any]) -> Any:
-        """Call a function with the current workspace, in a thread.
-
-        Raises:
-            HTTPException: if too many requests are pending.
-        """
+        """Call a function with the current workspace, in a thread. Raise HTTPException if too many requests are pending."""
         if self._waiting >= MOST_WAITING:
             raise HTTPException(429, "too many questions at a time; wait for an answer")
         self._waiting += 1
@@ -83,11 +73,7 @@ class Desk:
         return self._opened[model]
 
     def open(self, model: str) -> dict[str, Any]:
-        """Switch to another model; the workspace of the previous model is kept.
-
-        Raises:
-            UserError: for a model that cannot be opened.
-        """
+        """Switch to another model, and keep the workspace of the previous. Raise UserError for a model that cannot be opened."""
         require(model in self._models, "model", f"one of {', '.join(self._models)}", short(model))
         workspace = self._workspace(model)
         self._current = model

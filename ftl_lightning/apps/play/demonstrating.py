@@ -15,23 +15,15 @@ from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.services.errors import UserError, require, short
 from ftl_lightning.training.checks import fit_findings
 
-WANTED = 5
-"""Number of demonstrations that the page asks for."""
+WANTED = 5  # number of demonstrations that the page asks for
 MOST, MOST_SCENES, MOST_UNDONE = 50, 50, 50
 """Maximum number of demonstrations, of remembered scenes, and of changes that can be undone."""
-FILES = (".npz", ".safetensors")
-"""Suffixes of demonstration files, besides those of a domain's other programs."""
+FILES = (".npz", ".safetensors")  # suffixes of demonstration files, besides those of a domain's other programs
 
 
 class Demonstrating:
-    """Demonstrations of a concept, and the scenes in which more can be recorded.
-
-    Args:
-        model: model of the same domain.
-        source: library; files of recordings may be missing.
-
-    Attributes:
-        task: task of the last scene or demonstration drawn; empty for none.
+    """Demonstrations of a concept for a model, and the scenes in which more can be recorded. ``source`` is the library, whose
+    recordings may be missing; ``task`` that of the last scene or demonstration drawn, or empty.
     """
 
     def __init__(self, model: FewShot, source: Source) -> None:
@@ -95,11 +87,7 @@ class Demonstrating:
         return recorder
 
     def scene(self, request: requests.Pose) -> Json:
-        """Draw a new scene for a demonstration.
-
-        Raises:
-            UserError: in a domain without recording by hand, or for a task without scenes.
-        """
+        """Draw a new scene. Raise UserError in a domain without recording by hand, or for a task without scenes."""
         recorder = self._recorder()
         expected = f"one of {len(recorder.tasks)} whose scenes can be drawn"
         require(not request.task or request.task in recorder.tasks, "task", expected, short(request.task))
@@ -113,22 +101,14 @@ class Demonstrating:
         return {"scene": self._count, **content}
 
     def record(self, request: requests.Recorded) -> None:
-        """Add a demonstration recorded by hand.
-
-        Raises:
-            UserError: for an unknown scene, or a path that shows nothing.
-        """
+        """Add a demonstration recorded by hand. Raise UserError for an unknown scene, or a path that shows nothing."""
         recorder = self._recorder()
         require(request.scene in self._scenes, "scene", "a scene drawn before", f"{request.scene}; reload the page")
         scene = self._scenes[request.scene]
         self.add(recorder.record(scene, *check_path(scene, request.path, request.seconds)))
 
     def draw(self, request: requests.Drawn) -> None:
-        """Add demonstrations of the library: an expert's, or recordings.
-
-        Raises:
-            UserError: for a task without demonstrations.
-        """
+        """Add demonstrations of the library: an expert's, or recordings. Raise UserError for a task without demonstrations."""
         self._domain.check_goal(request.task, "task")
         self._count += 1
         self.add(self._source.draw(request.task, request.count, self._count))
@@ -163,12 +143,12 @@ class Demonstrating:
         require(request.id in self._entries, "id", "an existing demonstration", request.id)
         self._change({number: entry for number, entry in self._entries.items() if number != request.id})
 
-    def undo(self) -> None:
+    def undo(self, request: requests.Nothing) -> None:
         """Undo the last change."""
         if self._before:
             self._entries = self._before.pop()
 
-    def clear(self) -> None:
+    def clear(self, request: requests.Nothing) -> None:
         """Remove all demonstrations."""
         if self._entries:
             self._change({})

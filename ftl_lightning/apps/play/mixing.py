@@ -24,21 +24,13 @@ from ftl_lightning.services.errors import UserError, short
 from ftl_lightning.training.quality import judging_domain, right_plans
 
 Json = dict[str, Any]
-STEPS = 10
-"""Maximum number of sampling steps, so that a moving slider is answered at once."""
-JOINED = " and "
-"""Separator of the names of mixed concepts, for domains that read the result as a goal."""
+STEPS = 10  # maximum number of sampling steps, so that a moving slider is answered at once
+JOINED = " and "  # separator of the names of mixed concepts, for domains that read the result as a goal
 
 
 @dataclass(frozen=True)
 class Mixture:
-    """Concepts of a mixture.
-
-    Attributes:
-        concepts: compositions multiplied by their weights.
-        names: name of each concept.
-        examples: demonstrations of concepts learned here.
-    """
+    """Weighted concepts of a mixture, their names, and demonstrations of those learned here."""
 
     concepts: Sequence[Composition]
     names: Sequence[str]
@@ -58,10 +50,8 @@ def sampling_of(model: FewShot, temperature: float | None = None) -> dict[str, A
 
 
 def starts_of(model: FewShot, tasks: Sequence[str], count: int, seed: int) -> tuple[str, InitialStates | None]:
-    """Initial states of samples, and their task: the first that the domain reads; empty in domains without initial states.
-
-    Raises:
-        UserError: if the domain reads none of the tasks.
+    """Initial states, and their task, the first that the domain reads; neither without observations. Raise UserError if none is
+    read.
     """
     if not model.domain.observed:
         return "", None
@@ -72,10 +62,7 @@ def starts_of(model: FewShot, tasks: Sequence[str], count: int, seed: int) -> tu
 
 
 def goal_of(domain: Domain, names: Sequence[str], task: str) -> str:
-    """Goal by which a mixture is judged: the joined names if the domain reads them, else the requested task.
-
-    Empty if samples cannot be judged.
-    """
+    """Goal of a mixture: the joined names if the domain reads them, else the requested task; empty if samples cannot be judged."""
     reads = domain.concepts.reads
     return next((text for text in (JOINED.join(names), task) if text and reads(text)), "")
 
@@ -87,13 +74,7 @@ def judge_of(model: FewShot, examples: Sequence[Demonstrations]) -> Domain:
 
 
 def judged(domain: Domain, plans: Demonstrations, goal: str) -> tuple[list[Json], str]:
-    """Films of samples, and the fraction of correct samples in words; empty if not judged.
-
-    Args:
-        domain: domain that judges.
-        plans: samples.
-        goal: goal of the samples; empty for none.
-    """
+    """Films of samples, and the fraction of correct samples in words; empty without a goal, or if not judged."""
     success = right_plans(domain.measure(goal, plans.states, plans.initial_states)) if goal else None
     if success is None:
         return films(domain, plans), ""
@@ -102,19 +83,9 @@ def judged(domain: Domain, plans: Demonstrations, goal: str) -> tuple[list[Json]
 
 
 def samples(model: FewShot, mixture: Mixture, asked: Sample, tasks: Sequence[str]) -> tuple[list[Json], str, Sampled]:
-    """Generate samples of a mixture, or episodes that execute it.
-
-    Args:
-        model: generates the samples.
-        mixture: concepts of the mixture.
-        asked: number of samples, and settings.
-        tasks: tasks for initial states; the first that the domain reads is used.
-
-    Returns:
-        Films, the judgement in words, and the settings of sampling.
-
-    Raises:
-        UserError: for a task that the domain does not read, or if behaviour cannot be executed.
+    """Generate samples of a mixture, or episodes that execute it: films, the judgement in words, and the settings of sampling.
+    Initial states are of the first of ``tasks`` that the domain reads. Raise UserError for a task that it does not read, or if
+    behaviour cannot be executed.
     """
     judge = judge_of(model, mixture.examples)
     if asked.task:

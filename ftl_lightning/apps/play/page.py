@@ -34,27 +34,18 @@ POLICY = (
     "default-src 'none'; script-src 'nonce-{nonce}'; style-src 'nonce-{nonce}'; img-src data:; base-uri 'none'; form-action 'none'"
 )
 """Content security policy of every page: run its scripts, and load nothing."""
-WEIGHTS = (0.0, 0.5, 1.0, 1.5)
-"""Weights of each concept of a pair."""
-PAIRS, OTHERS = 4, 3
-"""Maximum number of pairs of concepts, and of training concepts mixed with a learned concept."""
-COUNT = 8
-"""Number of samples of each mixture."""
-MOST_SHOWN, MOST_CONCEPTS = 60, 100
-"""Maximum number of films per concept, and of concepts; the first are shown."""
-SAMPLES = 16
-"""Number of samples of a learned concept."""
-HEADER = 16 * 2**20
-"""Maximum bytes read to determine the kind of a file."""
+WEIGHTS = (0.0, 0.5, 1.0, 1.5)  # weights of each concept of a pair
+PAIRS, OTHERS = 4, 3  # maximum number of pairs of concepts, and of training concepts mixed with a learned concept
+COUNT = 8  # number of samples of each mixture
+MOST_SHOWN, MOST_CONCEPTS = 60, 100  # maximum number of films per concept, and of concepts; the first are shown
+SAMPLES = 16  # number of samples of a learned concept
+HEADER = 16 * 2**20  # maximum bytes read to determine the kind of a file
 
 
 def page(nonce: str, offline: bytes | None = None) -> str:
-    """The page as HTML.
-
-    Args:
-        nonce: nonce of style and scripts; letters and digits. The server sends a content security policy with the page.
-        offline: gzip of a JSON object of answers by :func:`request_key`, for a page without a server: ``/api/state``, thumbnails
-            and samples. Such a page contains its :data:`POLICY`.
+    """The page as HTML. The server sends a content security policy with the page for style and scripts with the ``nonce``. A page
+    without a server contains its :data:`POLICY`, and gzip of JSON answers by :func:`request_key`: ``/api/state``, thumbnails,
+    samples.
     """
     meta = f'<meta http-equiv="Content-Security-Policy" content="{POLICY.format(nonce=nonce)}">\n'
     parts = {
@@ -69,11 +60,8 @@ def page(nonce: str, offline: bytes | None = None) -> str:
 
 
 def request_key(path: str, body: Any = None) -> str:
-    """Key of a request among precomputed answers, as the page computes it.
-
-    Args:
-        path: such as ``/api/thumbnail?id=c1``.
-        body: body of a POST; keys in the page's order. Whole numbers are written without a point, as in JavaScript.
+    """Key of a request among precomputed answers, as the page computes it: path and query, then the body of a POST with keys in the
+    page's order and whole numbers without a point, as in JavaScript.
     """
     if body is None:
         return path
@@ -89,10 +77,8 @@ def _whole(value: Any) -> Any:
 
 
 def pairs_of(concepts: Sequence[dict[str, Any]], named: Sequence[tuple[str, str]] = ()) -> list[tuple[str, str]]:
-    """Pairs of concepts to mix, by their identifiers on the page.
-
-    Without named pairs, learned concepts are mixed with training concepts and with each other; if none are learned, training
-    concepts are mixed.
+    """Pairs of concepts to mix, by identifier. By default, learned concepts are mixed with training concepts and each other, or
+    training concepts alone.
     """
     if named:
         by_name = {concept["name"]: concept["id"] for concept in concepts}
@@ -147,11 +133,7 @@ def holds_results(file: str) -> bool:
 
 
 def results_page(file: str) -> str:
-    """The page of ``report --html`` of some results.
-
-    Raises:
-        UserError: if there are no results.
-    """
+    """The page of ``report --html`` of some results. Raise UserError if there are no results."""
     from ftl_lightning.reporting.page import write_page
 
     with tempfile.TemporaryDirectory() as folder:
@@ -161,14 +143,8 @@ def results_page(file: str) -> str:
 
 
 def viewed(file: str, model: str = "") -> dict[str, Any]:
-    """State of the page for a file.
-
-    Args:
-        file: demonstrations, samples or a learned concept; the name or folder of a data set.
-        model: model of a learned concept; empty to search for it.
-
-    Raises:
-        UserError: naming the file, if it is none of these.
+    """State of the page for demonstrations, samples, or a concept with its ``model`` (empty to search). Raise UserError for other
+    files.
     """
     path = Path(file)
     if path.suffix == ".safetensors":

@@ -1,7 +1,7 @@
 """Requests of the page, as read from JSON."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from ftl_lightning.services.errors import require
 from ftl_lightning.services.validation import check_count, check_factor, check_range
@@ -12,11 +12,7 @@ MOST_TEMPERATURE = 4.0
 
 
 def check_name(name: str) -> None:
-    """Refuse an invalid name.
-
-    Raises:
-        UserError: for an empty or too long name, or letters that cannot be printed.
-    """
+    """Refuse an invalid name. Raise UserError for an empty or too long name, or letters that cannot be printed."""
     require(1 <= len(name.strip()) <= MOST_NAME and name.isprintable(), "name", f"1 to {MOST_NAME} letters", len(name))
 
 
@@ -36,13 +32,7 @@ class Pose:
 
 @dataclass(frozen=True)
 class Recorded:
-    """Demonstration recorded by hand.
-
-    Attributes:
-        scene: number of the scene.
-        path: positions ``(step, piece, 2)`` in the film's unit.
-        seconds: time of each step, from any zero.
-    """
+    """Demonstration recorded by hand in a scene: positions ``(step, piece, 2)`` in the film's unit, and seconds from any zero."""
 
     scene: int
     path: Sequence[Sequence[Sequence[float]]]
@@ -92,12 +82,7 @@ class Nothing:
 
 @dataclass(frozen=True)
 class Learn:
-    """Learn from the current demonstrations.
-
-    Attributes:
-        name: name of the concept.
-        quick: learn in the paper's form until little changes; else in the form selected by the demonstrations.
-    """
+    """Learn from the current demonstrations: quickly in the paper's form, else in the form selected by the demonstrations."""
 
     name: str
     quick: bool = True
@@ -120,15 +105,8 @@ class Mixed:
 
 @dataclass(frozen=True)
 class Sample:
-    """Generate samples of a mixture.
-
-    Attributes:
-        parts: concepts of the mixture.
-        count: number of samples.
-        seed: seed of the noise and of the initial states.
-        temperature: temperature of the sampler; ``None`` for the tuned value.
-        execute: whether samples are executed in closed loop.
-        task: task of the initial states; empty for the default.
+    """Generate samples of a mixture. ``temperature`` is ``None`` for the tuned value, ``task`` empty for the default initial
+    states.
     """
 
     parts: Sequence[Mixed]
@@ -136,7 +114,7 @@ class Sample:
     seed: int = 0
     temperature: float | None = None
     execute: bool = False
-    task: str = field(default="")
+    task: str = ""
 
     def __post_init__(self) -> None:
         check_count("parts", len(self.parts), 1, MOST_PARTS)

@@ -10,21 +10,15 @@ from typing import Any
 from ftl_lightning.igm.concept import file_name
 from ftl_lightning.igm.settings import INVERSION
 
-FOLDER = "concepts"
-"""Folder to which commands write learned concepts."""
+FOLDER = "concepts"  # folder to which commands write learned concepts
 VARIABLES = frozenset({"model", "mixed", "starts", "samples", "episodes", *keyword.kwlist})
 """Names that are not allowed as a concept's variable."""
 
 
 @dataclass(frozen=True)
 class Learned:
-    """A concept that was learned on the page.
-
-    Attributes:
-        name: name during learning, which determines where learning starts.
-        label: current name on the page.
-        changes: settings that differ from the model's.
-        steps: number of gradient steps; ``None`` for the tuned number.
+    """A concept learned on the page: name during learning, which determines where learning starts; current name; settings that
+    differ from the model's; and gradient steps, ``None`` for the tuned number.
     """
 
     name: str
@@ -51,14 +45,8 @@ class Learned:
 
 @dataclass(frozen=True)
 class Part:
-    """A term of a mixture.
-
-    Attributes:
-        text: text of a training concept, or name of a learned concept.
-        weight: factor of the concept's weight.
-        groups: groups of columns on which the concept acts; empty for all.
-        learned: how the concept was learned here; else ``None``.
-        file: file of a concept that was neither learned here nor in pretraining; else empty.
+    """A term of a mixture: text of a training concept or name of a learned one, factor of its weight, groups of columns (empty for
+    all), how it was learned here, or the file of a concept from elsewhere.
     """
 
     text: str
@@ -70,12 +58,8 @@ class Part:
 
 @dataclass(frozen=True)
 class Sampled:
-    """Settings of sampling.
-
-    Attributes:
-        count, seed, temperature, sampler, steps: as in ``FewShot.sample``.
-        task: task of the initial states; empty in domains without any.
-        execute: whether samples were executed in closed loop.
+    """Settings of ``FewShot.sample``, task of the initial states (empty for none), and whether samples were executed in closed
+    loop.
     """
 
     count: int

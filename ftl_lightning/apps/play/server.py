@@ -25,12 +25,10 @@ from ftl_lightning.services.errors import UserError, mistake_of_machine, short
 from ftl_lightning.services.text import line, say
 
 LOOPBACK = "127.0.0.1"
-PORT = 8765
-"""Default port, unless another program uses it."""
+PORT = 8765  # default port, unless another program uses it
 MOST_CONNECTIONS, IDLE, PATIENCE = 200, 5, 3
 """Maximum number of connections, seconds before an idle connection is closed, and seconds for the last answers at the end."""
-TOKEN = "x-token"
-"""Header required in every request but the first."""
+TOKEN = "x-token"  # header required in every request but the first
 RECEIVE_SECONDS, END_SECONDS = 30.0, 0.25
 """Maximum seconds to receive a request, and seconds from the request to end the program to its end."""
 HEADERS: Mapping[str, str] = {
@@ -56,8 +54,7 @@ MISTAKES = (
     ValueError,
 )
 """Exceptions that are reported in one line. Starlette handles the class Exception outside of the guard, which adds headers."""
-Begin = Callable[[], Awaitable[Any]]
-"""Called at the start, while requests are already answered."""
+Begin = Callable[[], Awaitable[Any]]  # called at the start, while requests are already answered
 
 
 class Guard:
@@ -101,11 +98,7 @@ class Guard:
 
 
 async def body_of(request: Request, most: int) -> bytes:
-    """Read the bytes of a request.
-
-    Raises:
-        HTTPException: for more than ``most`` bytes, or if they take too long.
-    """
+    """Read the bytes of a request. Raise HTTPException for more than ``most`` bytes, or if they take too long."""
     message = f"expected at most {most // 2**20} MB, found more"
     length = request.headers.get("content-length", "0")
     if not length.isdecimal() or int(length) > most:
@@ -125,14 +118,8 @@ async def body_of(request: Request, most: int) -> bytes:
 def guarded(
     routes: Sequence[Route], token: str, hosts: Sequence[str], end: Callable[[], None], begin: Begin | None = None
 ) -> Starlette:
-    """Application that answers requests of a single page.
-
-    Args:
-        routes: routes besides the end of the program.
-        token: required in requests.
-        hosts: ``host:port`` that requests may name.
-        end: ends the program.
-        begin: called at the start; ``None`` for nothing.
+    """Application of a single page: answer requests that name the token and one of the ``hosts`` (``host:port``), by ``routes`` or
+    by ``end``, which ends the program. ``begin`` is called at the start.
     """
 
     async def ended(request: Request) -> Response:
@@ -175,12 +162,8 @@ async def _mistaken(request: Request, error: Exception) -> Response:
 
 @dataclass(frozen=True)
 class Place:
-    """Address of a page.
-
-    Attributes:
-        host: address to listen on; any but the loopback address admits other machines, with a warning.
-        port: port number; 0 for :data:`PORT`, or any free port if that is in use.
-        browser: whether to open a browser.
+    """Address of a page; any host but the loopback admits other machines, with a warning. Port 0 is :data:`PORT`, or any if that is
+    in use.
     """
 
     host: str = LOOPBACK
@@ -188,17 +171,8 @@ class Place:
     browser: bool = True
 
 
-def serve(
-    routes: Sequence[Route],
-    place: Place,
-    begin: Begin | None = None,
-    close: Callable[[], None] = lambda: None,
-) -> None:
-    """Serve a page until Ctrl-C, or until the page ends the program; ``close`` is called at the end.
-
-    Raises:
-        UserError: if the address is not available.
-    """
+def serve(routes: Sequence[Route], place: Place, begin: Begin | None = None, close: Callable[[], None] = lambda: None) -> None:
+    """Serve a page until Ctrl-C or its end, then call ``close``. Raise UserError if the address is not available."""
     listening = _listening(place.host, place.port)
     port, names, token = listening.getsockname()[1], _names(place.host), secrets.token_urlsafe(24)
     hosts = [f"{name}:{port}" for name in names]
@@ -226,12 +200,7 @@ def serve(
 
 
 class _Server(uvicorn.Server):
-    """Server that stops running work before it waits for the last answers.
-
-    Args:
-        config: settings of the server.
-        close: called first when the program ends.
-    """
+    """Server that stops running work, by ``close``, before it waits for the last answers."""
 
     def __init__(self, config: uvicorn.Config, close: Callable[[], None]) -> None:
         super().__init__(config)

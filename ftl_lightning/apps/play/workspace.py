@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import monotonic
-from typing import Any
+from typing import Any, TypeVar
 
 from ftl_lightning.apps.play import requests
 from ftl_lightning.apps.play.demonstrating import Demonstrating, as_npz
@@ -23,17 +23,15 @@ from ftl_lightning.igm.settings import PAPER
 from ftl_lightning.services.errors import UserError, require, short
 from ftl_lightning.services.tensor_file import kind_of
 
-SHOWN, SHOWN_FIRST = 8, 4
-"""Number of samples shown of a learned concept, and during learning."""
+SHOWN, SHOWN_FIRST = 8, 4  # number of samples shown of a learned concept, and during learning
 FIRST, INTERVAL, RATIO = 0.2, 0.5, 3.0
 """Seconds of learning before the first samples, minimum seconds between samples, minimum ratio of learning to sampling time."""
-REPORT = 0.05
-"""Minimum seconds between reported losses: each report takes time from learning."""
+REPORT = 0.05  # minimum seconds between reported losses: each report takes time from learning
 QUICK: Mapping[str, Any] = {"form": PAPER, "samples": 16, "learning_rate": 0.3}
-QUICK_STEPS = 250
-"""Steps of quick learning from a user's data; chosen on strokes, see docs/experiments-own-data.md."""
+QUICK_STEPS = 250  # steps of quick learning from a user's data; chosen on strokes, see docs/experiments-own-data.md
 
 Tell = Callable[[Json], None]
+R = TypeVar("R")
 
 
 def title_of(model: str) -> str:
@@ -50,13 +48,10 @@ class Known:
     """Concept that can be mixed.
 
     Attributes:
-        name: text of the concept.
-        kind: ``'training'``; ``'shipped'`` or ``'saved'`` in the model's library; ``'opened'`` from a file; ``'learned'`` here.
-        composition: composition to sample from.
-        concept: content of the concept's file; ``None`` for a training concept.
-        file: path or name of the concept's file; empty for training concepts and those learned here.
-        learned: how the concept was learned here; else ``None``.
-        demonstrations: training data of a concept learned here; else ``None``.
+        name, kind: text, and ``'training'``; ``'shipped'`` or ``'saved'`` in the model's library; ``'opened'`` from a file;
+            ``'learned'`` here.
+        concept, file: content, and path or name of the concept's file; none for training concepts, no path for those learned here.
+        learned, demonstrations: how the concept was learned here, and from what; else ``None``.
         accuracy: fraction of correct samples; ``None`` if not judged.
     """
 
@@ -79,12 +74,19 @@ class Known:
         return content
 
 
-class Workspace:
-    """Model and the state of its session. No files are written: the browser saves them.
+def _changing(change: Callable[[Demonstrating, R], None]) -> Callable[["Workspace", R], Json]:
+    """Method that changes the demonstrations and returns the new work."""
 
-    Args:
-        model: name of a shipped model, or a folder.
-        root: folder of the user's copy of recordings, for domains whose demonstrations do not ship.
+    def method(workspace: "Workspace", request: R) -> Json:
+        change(workspace._demonstrating, request)
+        return workspace.work()
+
+    return method
+
+
+class Workspace:
+    """Model, by name or folder, and the state of its session. No files are written: the browser saves them. ``root`` is the user's
+    copy of recordings, for domains whose demonstrations do not ship.
     """
 
     def __init__(self, model: str, root: Path | None = None) -> None:
@@ -132,43 +134,15 @@ class Workspace:
         """Suggested name of the concept: the name of the demonstrations, if a file or the library gave it."""
         return self._demonstrating.name or "new concept"
 
-    # Demonstrations: each change returns the new work.
-
     def scene(self, request: requests.Pose) -> Json:
         """Draw a new scene for a demonstration."""
         return self._demonstrating.scene(request)
 
-    def record(self, request: requests.Recorded) -> Json:
-        """Add a demonstration recorded by hand."""
-        self._demonstrating.record(request)
-        return self.work()
-
-    def draw(self, request: requests.Drawn) -> Json:
-        """Add demonstrations of the library."""
-        self._demonstrating.draw(request)
-        return self.work()
-
-    def remove(self, request: requests.One) -> Json:
-        """Remove a demonstration."""
-        self._demonstrating.remove(request)
-        return self.work()
-
-    def undo(self, request: requests.Nothing) -> Json:
-        """Undo the last change."""
-        self._demonstrating.undo()
-        return self.work()
-
-    def clear(self, request: requests.Nothing) -> Json:
-        """Remove all demonstrations."""
-        self._demonstrating.clear()
-        return self.work()
+    record, draw = _changing(Demonstrating.record), _changing(Demonstrating.draw)
+    remove, undo, clear = _changing(Demonstrating.remove), _changing(Demonstrating.undo), _changing(Demonstrating.clear)
 
     def upload(self, name: str, content: bytes) -> None:
-        """Read a file of demonstrations, of a concept, or of another program.
-
-        Raises:
-            UserError: for another kind of file, or a file of another model or domain.
-        """
+        """Read demonstrations, a concept, or another program's file. Raise UserError for others, or another model or domain."""
         ending, endings = Path(name).suffix.lower(), self._demonstrating.files
         require(ending in endings, "file", f"a name that ends in {' or '.join(endings)}", repr(short(name)))
         if ending == ".safetensors" and kind_of(content) == KIND:
@@ -177,11 +151,7 @@ class Workspace:
             self._demonstrating.read(name, content)
 
     def demonstrations_file(self, key: str) -> tuple[str, bytes]:
-        """Name and bytes of an ``.npz`` of the current demonstrations, or of those of a concept learned here.
-
-        Raises:
-            UserError: if there are none.
-        """
+        """Name and bytes of an ``.npz`` of the current demonstrations, or of a concept's. Raise UserError if there are none."""
         if not key:
             return "demonstrations.npz", as_npz(self._demonstrating.together(""))
         known = self._known(key)
@@ -243,11 +213,8 @@ class Workspace:
         self._concepts[request.id] = replace(known, name=name, concept=concept, learned=learned)
 
     def learn(self, request: requests.Learn, tell: Tell, stopped: Callable[[], bool]) -> None:
-        """Learn a concept from the demonstrations, and report loss and samples meanwhile by ``tell``.
-
-        Raises:
-            UserError: without demonstrations, or if they cannot be learned from.
-            Stopped: if no client waits.
+        """Learn a concept from the demonstrations, and report loss and samples meanwhile by ``tell``. Raise UserError if there are
+        none or they cannot be learned from, and Stopped if no client waits.
         """
         name = " ".join(request.name.split())
         demonstrations, begin = self._demonstrating.together(name), monotonic()
@@ -306,11 +273,7 @@ class Workspace:
     # Samples.
 
     def sample(self, request: requests.Sample) -> Json:
-        """Generate samples of a mixture.
-
-        Raises:
-            UserError: for an unknown concept or group, or if behaviour cannot be executed.
-        """
+        """Generate samples of a mixture. Raise UserError for an unknown concept or group, or if behaviour cannot be executed."""
         begin = monotonic()
         known = [self._known(part.id) for part in request.parts]
         width, plans = self._model.model.config.state_dim, self._domain.plans

@@ -21,8 +21,7 @@ from ftl_lightning.services.text import line, plain, script_json
 from ftl_lightning.services.validation import read_json
 
 PAGE, KEY = "study.html", "key.json"
-KEY_KIND, FORMAT = "study key", 1
-"""Kind and format of the key's file."""
+KEY_KIND, FORMAT = "study key", 1  #: Kind and format of the key's file.
 HERE = Path(__file__).parent
 CONSENT = (
     "You will see short films of generated behaviour and say what they depict. It takes about {minutes} minutes. "
@@ -48,17 +47,13 @@ class Made:
 
 
 def make_study(domain: Domain, questions: Questions, out: Path, title: str = "", consent: str = "") -> Made:
-    """Write a study's page and key; the same questions and options give the same bytes.
+    """Write a study's page and key; the same questions and options give the same bytes. Raise UserError if ``out`` has the key of
+    another study.
 
     Args:
-        domain: domain of the films.
-        questions: questions about the films.
+        domain, questions: domain of the films, and questions about them.
         out: folder to write to.
-        title: title of the page; empty for a neutral title.
-        consent: consent of raters; empty for :data:`CONSENT`.
-
-    Raises:
-        UserError: if ``out`` has the key of another study.
+        title, consent: title of the page, and consent of raters; empty for a neutral title and :data:`CONSENT`.
     """
     minutes = max(1, round(len(questions.page) * SECONDS_A_QUESTION / 60))
     content: dict[str, Any] = {

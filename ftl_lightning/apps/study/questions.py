@@ -20,15 +20,12 @@ from ftl_lightning.services.text import line
 from ftl_lightning.services.validation import from_mapping, read_json
 
 LISTING = "films.json"
-TRAINING, NEW = "training", "new"
-"""Settings: concepts of pretraining, and new concepts."""
-CHECKS = {"check-yes": "yes", "check-no": "no"}
-"""Pseudo-methods of films with an obvious answer, and that answer."""
+TRAINING, NEW = "training", "new"  #: Settings: concepts of pretraining, and new concepts.
+CHECKS = {"check-yes": "yes", "check-no": "no"}  #: Pseudo-methods of films with an obvious answer, and that answer.
 YES, NO = "yes", "no"
 DEPICTS, BEST = "depicts", "best"
 """The two questions of the paper: whether a film depicts a concept, and which of several films depicts it best."""
-CHECK, REPEAT = "check", "repeat"
-"""Questions with a known answer, and repeated questions about the same film."""
+CHECK, REPEAT = "check", "repeat"  #: Questions with a known answer, and repeated questions about the same film.
 INSTRUCTIONS = {YES: "This question checks attention: please answer Yes.", NO: "This question checks attention: please answer No."}
 
 
@@ -51,11 +48,9 @@ class Film:
     Attributes:
         setting: :data:`TRAINING` or :data:`NEW`, or another name from a listing.
         scenario: unit of comparison between methods: a concept from one initial state.
-        concept: text shown to raters.
-        method: method that generated the behaviour, or one of :data:`CHECKS`.
+        concept, method: text shown to raters, and method that generated the behaviour, or one of :data:`CHECKS`.
         states: ``(time, state)`` in the domain's units.
-        file, row: source of the behaviour.
-        hash: hash of the file.
+        file, row, hash: source of the behaviour, and hash of the file.
     """
 
     setting: str
@@ -69,23 +64,12 @@ class Film:
 
 
 def read_films(folder: Path, domain: Domain, scenarios: int, seed: int) -> list[Film]:
-    """Read the films of a folder.
-
-    The folder has either a file ``films.json``, a list of ``{"concept", "method", "file"}`` with optional ``"scenario"``,
-    ``"setting"`` and ``"row"``, or only files named ``METHOD/CONCEPT.safetensors``. Files are outputs of ``sample --out``. The
-    concept is read from the file, or else is the file's name, where an underscore is a space.
-
-    Rows are drawn at random, and are the same for all methods, because equal rows have the same initial state.
-
-    Args:
-        folder: folder of the user.
-        domain: domain of the behaviour.
-        scenarios: number of scenarios of each concept.
-        seed: random seed of rows that are not listed.
-
-    Raises:
-        UserError: for a domain without films, for files that are missing, of another domain or without enough samples, and for a
-            scenario that lacks a method.
+    """Read the films of a folder: either of a file ``films.json``, a list of ``{"concept", "method", "file"}`` with optional
+    ``"scenario"``, ``"setting"`` and ``"row"``, or of files ``METHOD/CONCEPT.safetensors``, outputs of ``sample --out``. The
+    concept is read from the file, or else is the file's name, where an underscore is a space. Rows that are not listed are drawn by
+    ``seed`` for a number of ``scenarios`` of each concept, equal for all methods, because equal rows have the same initial state.
+    Raise UserError for a domain without films, for files that are missing, of another domain or without enough samples, and for a
+    scenario that lacks a method.
     """
     filmed = domain.show.film is not None or domain.show.wireframe is not None
     require(filmed, "domain", "a domain whose plans are filmed", f"{domain.name}, which has no films")
@@ -172,15 +156,12 @@ def _check_scenarios(folder: Path, films: Sequence[Film]) -> None:
 
 @dataclass(frozen=True)
 class Questions:
-    """A study's films and questions.
+    """A study's films, in the order of their numbers, and questions.
 
     Attributes:
-        films: in the order of their numbers.
         still: numbers of films that are shown as their first state only.
         page: questions on the page: ``{"id", "text", "films"}``, a single film for yes or no, several films to choose from.
-        key: meaning of each question, by id.
-        shown: source of each film, by id.
-        seed: random seed of the numbers.
+        key, shown: meaning of each question, and source of each film, by id.
     """
 
     films: tuple[Film, ...]
@@ -197,13 +178,9 @@ def film_id(number: int) -> str:
 
 
 def ask(films: Sequence[Film], repeats: int, still: int, seed: int) -> Questions:
-    """Ask whether each film depicts its concept, which film of a scenario depicts it best, and checks.
-
-    Args:
-        films: one film of each method in every scenario, and checks.
-        repeats: number of questions that are asked twice.
-        still: number of films that are repeated as a standing picture, which depicts no motion.
-        seed: random seed of the numbers, and of the repeated and standing films.
+    """Ask whether each film depicts its concept, which film of a scenario depicts it best, and checks: ``repeats`` questions are
+    asked twice, and ``still`` films are repeated as a standing picture, which depicts no motion. Films are one of each method in
+    every scenario, and checks; ``seed`` determines numbers, and repeated and standing films.
     """
     rng = np.random.default_rng(seed)
     real = [film for film in films if film.method not in CHECKS]

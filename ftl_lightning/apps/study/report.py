@@ -20,10 +20,8 @@ from ftl_lightning.services.text import line
 from ftl_lightning.services.validation import from_mapping, read_json
 
 ANSWERS_KIND = "study answers"
-REPEATS_THAT_MAY_DIFFER = 0.5
-"""Maximum fraction of repeated questions that an attentive rater may answer inconsistently."""
-LABELS = {BEST: "judged best", DEPICTS: "depicts the concept"}
-"""Labels of the questions, in the order of the paper's table."""
+REPEATS_THAT_MAY_DIFFER = 0.5  #: Maximum fraction of repeated questions that an attentive rater may answer inconsistently.
+LABELS = {BEST: "judged best", DEPICTS: "depicts the concept"}  #: Labels of the questions, in the order of the paper's table.
 NOTES = (
     "mean ± standard deviation over raters of each rater's mean over scenarios, as in the paper; in brackets Wilson's 95 %",
     "interval, which takes answers as independent and is too narrow where they are not; alpha: Krippendorff's, nominal",
@@ -33,13 +31,7 @@ NOTES = (
 
 @dataclass(frozen=True)
 class Question:
-    """Meaning of a question.
-
-    Attributes:
-        kind, text, films: kind, text, and ids of the films.
-        expected: known answer of a check.
-        scenario, setting: scenario and setting of a comparison.
-    """
+    """Meaning of a question about films, by id: the known answer of a check, or scenario and setting of a comparison."""
 
     kind: Literal["depicts", "best", "check", "repeat"]
     text: str
@@ -65,12 +57,7 @@ class FilmSource:
 
 @dataclass(frozen=True)
 class Key:
-    """Meaning of a study's questions and films.
-
-    Attributes:
-        study, page: 16-digit identifiers of the study and of its page.
-        questions, films: by id.
-    """
+    """Meaning of a study's questions and films, by id, with 16-digit identifiers of the study and of its page."""
 
     study: str
     page: str
@@ -107,11 +94,7 @@ def _json(path: Path, kind: str) -> dict[str, Any]:
 
 
 def read_key(path: Path) -> Key:
-    """Read the key written by ``study``.
-
-    Raises:
-        UserError: naming the file, if it is missing, damaged or of another kind.
-    """
+    """Read the key written by ``study``. Raise UserError naming the file, if it is missing, damaged or of another kind."""
     content = _json(path, KEY_KIND)
     with about(path):
         key = from_mapping(Key, {name: content[name] for name in ("study", "page", "questions", "films") if name in content}, "")
@@ -127,11 +110,7 @@ def read_key(path: Path) -> Key:
 
 
 def read_rater(path: Path, key: Key) -> Rater:
-    """Read one file of answers.
-
-    Raises:
-        UserError: naming the file, if it is missing, damaged, of another study, of another page, or not finished.
-    """
+    """Read a file of answers. Raise UserError if it is missing, damaged, of another study or page, or not finished."""
     content = _json(path, ANSWERS_KIND)
     for part, expected in (("study", key.study), ("page", key.page)):
         found = f"{shown(content.get(part))}; the answers are of another {part}"
@@ -178,10 +157,8 @@ def read_raters(paths: Sequence[Path], key: Key) -> tuple[list[Rater], list[str]
 
 
 def inattention(rater: Rater, key: Key) -> str:
-    """Reason to exclude a rater's answers; empty if they count.
-
-    A rater fails by answering any check wrongly, or more than :data:`REPEATS_THAT_MAY_DIFFER` of the repeated questions
-    inconsistently.
+    """Reason to exclude a rater's answers, or empty: any check answered wrongly, or more than :data:`REPEATS_THAT_MAY_DIFFER` of
+    the repeated questions answered inconsistently.
     """
     checks = key.of_kind(CHECK)
     wrong = sum(rater.answers[name] != question.expected for name, question in checks.items())
@@ -195,15 +172,10 @@ def inattention(rater: Rater, key: Key) -> str:
 
 
 def krippendorff_alpha(units: Iterable[Sequence[Hashable]]) -> float:
-    """Krippendorff's alpha of categories without an order: 1 for full agreement, 0 for agreement by chance, negative for less.
-
-    ``1 - D_observed / D_expected``, see K. Krippendorff, "Computing Krippendorff's Alpha-Reliability", 2011, part C and D.
-
-    Args:
-        units: for each item, the categories given by raters, in any order; items with fewer than two ratings do not count.
-
-    Returns:
-        alpha, or NaN if nothing varies, because agreement is then indistinguishable from habit.
+    """Krippendorff's alpha of categories without an order: 1 for full agreement, 0 for agreement by chance, negative for less. ``1
+    - D_observed / D_expected``, see K. Krippendorff, "Computing Krippendorff's Alpha-Reliability", 2011, part C and D. Each unit
+    has the categories given by raters; fewer than two do not count. NaN if nothing varies: agreement is then indistinguishable from
+    habit.
     """
     paired = [Counter(unit) for unit in units if len(unit) > 1]
     totals = sum(paired, Counter())
@@ -221,8 +193,7 @@ class Share:
     Attributes:
         mean: mean over raters and scenarios.
         spread: standard deviation over raters of each rater's mean over scenarios (divisor: number of raters, as in the paper).
-        low, high: Wilson's 95 % interval, as if answers were independent.
-        answers: number of answers.
+        low, high: Wilson's 95 % interval, as if the ``answers`` were independent.
     """
 
     mean: float
@@ -237,12 +208,10 @@ class Report:
     """Results of a study.
 
     Attributes:
-        shares: by setting, question and method.
-        agreement: Krippendorff's alpha by setting and question.
-        scenarios: number of scenarios, by setting.
-        raters: number of raters whose answers count.
-        dropped: one line for every inattentive rater.
-        refused: one line for every file that does not have finished answers to this study.
+        shares, agreement: by setting, question and method; and Krippendorff's alpha by setting and question.
+        scenarios, raters: number of scenarios by setting, and of raters whose answers count.
+        dropped, refused: one line for every inattentive rater, and for every file that does not have finished answers to this
+            study.
     """
 
     shares: Mapping[tuple[str, str, str], Share]
@@ -281,15 +250,8 @@ def _cell(share: Share) -> str:
 
 
 def study_table(answers: Sequence[Path], key: Path, keep_all: bool = False) -> Report:
-    """The table of a study's answers.
-
-    Args:
-        answers: files, or folders of files ``answers*.json``.
-        key: the study's key.
-        keep_all: whether raters who failed attention checks count.
-
-    Raises:
-        UserError: for a key that cannot be read, and if no rater is left, with the first reason.
+    """The table of a study's answers, in files or in folders of ``answers*.json``; with ``keep_all``, raters who failed attention
+    checks count. Raise UserError for a key that cannot be read, and if no rater is left, with the first reason.
     """
     known = read_key(key)
     raters, refused = read_raters(answers, known)

@@ -13,6 +13,9 @@ from ftl_lightning.data.demonstrations import Contents, Demonstrations, padded
 from ftl_lightning.services.errors import require, short
 from ftl_lightning.services.files import VARIABLE, most_bytes
 
+PART = "observation"
+"""Key of the states in observations of several parts, as in Gymnasium's environments with goals."""
+
 
 @dataclass(frozen=True)
 class Episode:

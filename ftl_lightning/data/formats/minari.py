@@ -17,8 +17,7 @@ from typing import Any
 import numpy as np
 
 from ftl_lightning.data.demonstrations import FORMATS, Contents, Demonstrations, Format
-from ftl_lightning.data.formats.episodes import Episode, Metadata, check_names, from_episodes, measured, metadata, to_episodes
-from ftl_lightning.data.recording import PART, feature_parts, states_part
+from ftl_lightning.data.formats.episodes import PART, Episode, Metadata, check_names, from_episodes, measured, metadata, to_episodes
 from ftl_lightning.services.errors import UserError, about, require, short
 from ftl_lightning.services.shipped import check_extra
 from ftl_lightning.services.validation import from_mapping
@@ -50,6 +49,8 @@ def read_minari(name: str, part: str = "", observed: Sequence[str] | None = None
 def _contents(name: str, part: str = "", observed: Sequence[str] | None = None) -> Contents:
     check_extra("minari", f"{name}: expected a file, found none; a Minari data set of this name")
     import minari
+
+    from ftl_lightning.data.recording import feature_parts, states_part
 
     try:
         dataset = minari.load_dataset(name)

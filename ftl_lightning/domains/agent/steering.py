@@ -47,7 +47,8 @@ def record(scene_before: Scene, path: Numbers, seconds: Numbers) -> Demonstratio
     assert scene_before.starts is not None  # set by `scene`
     world = scene_before.starts.observed[OBSERVED]
     start = world[:, list(PLANE)].double().numpy()
-    hand = np.concatenate((start, path[:, 0].clip(*zip(*SEEN, strict=True))))
+    lower, upper = np.array(SEEN).T
+    hand = np.concatenate((start, path[:, 0].clip(lower, upper)))
     length = reached(hand)[-1]
     require(length >= SHORTEST, "way", f"one of at least {SHORTEST:g} m", f"{length:.2f} m; lead the agent further")
     way = _before_objects(smoothed(hand, BLUR), object_positions(world)[0].double().numpy()[:, PLANE])
