@@ -377,10 +377,10 @@ CURVE = {"curve": "a", "steps": 1, "seconds": 1, "accuracy": 1}
     ("name", "content", "message"),
     [
         ("speed.json", {"curves": [CURVE, CURVE | {"accuracy": None}]}, "key 'curves[1].accuracy'"),
-        ("speed.json", {"curves": [CURVE | {"seconds": "1"}]}, "key 'curves[0].seconds'"),
+        ("speed.json", {"curves": [CURVE | {"seconds": "1"}]}, "key 'curves[0].steps'"),
         ("speed.json", {"curves": [CURVE | {"curve": ["a"]}]}, "key 'curves[0].curve'"),
         ("speed.json", {"curves": [CURVE | {"accuracy": True}]}, "key 'curves[0].accuracy'"),
-        ("speed.json", {"curves": [{"curve": "a"}]}, "key 'curves[0].seconds'"),
+        ("speed.json", {"curves": [{"curve": "a"}]}, "key 'curves[0].steps'"),
         *(("speed.json", content, "key 'curves': expected a list") for content in ({"curves": {}}, [])),
         ("speed.json", {"curves": [7]}, "key 'curves[0]': expected a mapping, found 7"),
         ("frontier.json", {"rows": [tempered("a", domain=None)]}, "key 'rows[0].domain': expected a value"),

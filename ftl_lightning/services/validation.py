@@ -141,8 +141,8 @@ def from_mapping(kind: Callable[..., T], content: object, key: str, *given: obje
         raise UserError(f"{_place(key)}: expected a mapping, found {shown(content)}")
     for name in content:
         require(name in names, _place(_joined(key, name)), f"one of {short(', '.join(names), 120)}", "another key")
-    for name in needed.intersection(names):
-        require(name in content, _place(_joined(key, name)), "a value", "none")
+    for name in names:
+        require(name in content or name not in needed, _place(_joined(key, name)), "a value", "none")
     return kind(*given, **{name: check_type(value, hints[name], _joined(key, name)) for name, value in content.items()})
 
 
