@@ -377,7 +377,7 @@ CURVE = {"curve": "a", "steps": 1, "seconds": 1, "accuracy": 1}
     ("name", "content", "message"),
     [
         ("speed.json", {"curves": [CURVE, CURVE | {"accuracy": None}]}, "key 'curves[1].accuracy'"),
-        ("speed.json", {"curves": [CURVE | {"seconds": "1"}]}, "key 'curves[0].steps'"),
+        ("speed.json", {"curves": [CURVE | {"seconds": "1"}]}, "key 'curves[0].seconds'"),
         ("speed.json", {"curves": [CURVE | {"curve": ["a"]}]}, "key 'curves[0].curve'"),
         ("speed.json", {"curves": [CURVE | {"accuracy": True}]}, "key 'curves[0].accuracy'"),
         ("speed.json", {"curves": [{"curve": "a"}]}, "key 'curves[0].steps'"),

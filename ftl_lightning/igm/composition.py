@@ -27,7 +27,7 @@ class Adapter(Protocol):
 
 
 def space_of(domain: str, model_hash: str) -> str:
-    """Description of a model's concept space."""
+    """Description of a concept space: the model's ``domain`` and ``model_hash``."""
     return f"{domain} (hash {model_hash})"
 
 

@@ -47,7 +47,7 @@ class Summary:
 
 
 def summary(path: str | Path) -> Summary | None:
-    """Summarise a concept's file. The tensors are neither read nor checked.
+    """Summarise a concept's file ``path``. The tensors are neither read nor checked.
 
     Returns:
         ``None`` for another kind of file of this package, such as a model.
@@ -182,7 +182,7 @@ class Library(Shown):
 
 
 def table(entries: Sequence[Entry]) -> str:
-    """Table of concepts in aligned columns under :data:`HEADINGS`."""
+    """Table of ``entries``: table of concepts in aligned columns under :data:`HEADINGS`."""
     rows = [HEADINGS, *(entry.cells for entry in entries)]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return "\n".join("  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows)
@@ -250,7 +250,7 @@ def library(model: str, training: Sequence[str], own: Path | None = None, folder
 
 
 def concept_files(names: Iterable[str], folder: Path, place: str) -> dict[str, Path]:
-    """Output files of learned concepts by name.
+    """Output files of learned concepts in ``folder``, by the ``names`` of the concepts. ``place`` names the option in messages.
 
     Raises:
         UserError: for two names with the same file, or a file that cannot be written.

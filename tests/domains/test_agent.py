@@ -119,7 +119,7 @@ def test_forces_move_the_agent_and_nothing_else_and_bodies_are_solid(environment
     assert np.abs(pushed[:, 3:7] - [0, 0, 0, 1]).max() < 1e-6
     assert (pushed[:, 13:] == pushed[0, 13:]).all()
     # A force in newtons that equals the way in metres LOOKAHEAD steps ahead holds a steady speed.
-    assert pushed[-1, 7] == pytest.approx(0.1 / (expert.LOOKAHEAD * STEP), rel=0.05)
+    assert pushed[-1, 7] == pytest.approx(0.1 / (world.LOOKAHEAD * STEP), rel=0.05)
     strong, limited = run(environment, [(5, 0)] * 3), run(environment, [(MAX_FORCE, 0)] * 3)
     assert strong[-1, 0] == pytest.approx(limited[-1, 0])
     seen = run(environment, [(MAX_FORCE, 0)] * 80)

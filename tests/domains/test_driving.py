@@ -10,7 +10,7 @@ import pytest
 import torch
 from highway_env.vehicle.behavior import IDMVehicle
 
-from ftl_lightning.domains.driving import expert
+from ftl_lightning.domains.driving import expert, traffic
 from ftl_lightning.domains.driving.environment import DrivingEnvironment
 from ftl_lightning.domains.driving.scenarios import SCENARIOS, advance, arrived, make, observe, restore, save
 from ftl_lightning.domains.driving.traffic import (
@@ -257,7 +257,7 @@ def test_demonstrations_drive_on_and_go_on_where_they_stopped(monkeypatch: pytes
 
     def drive(name: str, seed: int, blind: bool) -> tuple[np.ndarray, bool]:
         driven.append(seed)
-        return WHOLE * again.random(dtype=np.float32), seed != expert.episode_seed(0, 1)
+        return WHOLE * again.random(dtype=np.float32), seed != traffic.episode_seed(0, 1)
 
     monkeypatch.setattr(expert, "drive", drive)
     told: list[int] = []
@@ -271,11 +271,11 @@ def test_demonstrations_drive_on_and_go_on_where_they_stopped(monkeypatch: pytes
         assert len(beyond) >= 8
         straight = found.states[row, length - 1, 1] + beyond * found.states[row, -1, 3]
         torch.testing.assert_close(found.states[row, length:, 1], straight)
-        assert origin(begun) == ("merge", expert.episode_seed(0, 2 * row))
+        assert origin(begun) == ("merge", traffic.episode_seed(0, 2 * row))
     shard = expert.shard("merge", driven[-1])
     shard.write_bytes(shard.read_bytes()[:-20])  # damaged: driven again
     other = expert.demonstrations("merge", 2, 0, 1, lambda: None)
-    assert driven == [expert.episode_seed(0, number) for number in (0, 1, 2, 2)]
+    assert driven == [traffic.episode_seed(0, number) for number in (0, 1, 2, 2)]
     assert other.hash != found.hash
     assert expert.demonstrations("merge", 2, 0, 1, lambda: None).hash == other.hash
     assert len(driven) == 4
@@ -295,15 +295,15 @@ def test_demonstrations_do_not_depend_on_workers(tmp_path: Path, monkeypatch: py
 
 def test_an_episode_that_raises_counts_as_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
     def drive(name: str, seed: int, blind: bool) -> tuple[np.ndarray, bool]:
-        if seed == expert.episode_seed(0, 0):
+        if seed == traffic.episode_seed(0, 0):
             raise RuntimeError("the simulator broke")
-        return WHOLE, seed != expert.episode_seed(0, 1)
+        return WHOLE, seed != traffic.episode_seed(0, 1)
 
     monkeypatch.setattr(expert, "drive", drive)
     found = expert.demonstrations("merge", 2, 0, 1, lambda: None)
     assert (found.provenance["driven"], found.provenance["rejected"]) == (4, 2)
-    assert not expert.shard("merge", expert.episode_seed(0, 0)).exists()  # next time it is driven again
-    assert expert.shard("merge", expert.episode_seed(0, 1)).exists()
+    assert not expert.shard("merge", traffic.episode_seed(0, 0)).exists()  # next time it is driven again
+    assert expert.shard("merge", traffic.episode_seed(0, 1)).exists()
     monkeypatch.setattr(expert, "drive", lambda *_, **options: (WHOLE, False))
     with pytest.raises(UserError, match="expected 1 successful episodes of 4, found 0"):
         expert.demonstrations("exit", 1, 0, 1, lambda: None)

@@ -244,7 +244,6 @@ def test_concepts_are_drawn_by_a_power_of_their_size_where_a_balance_is_given(sh
     even = PretrainingData(domain=NAME, root=str(shared), batch_size=512, balance=0)
     for data in (plain, even):
         data.setup("fit")
-    assert "balance" not in plain.hparams
     counts = even.batch(0).concepts.bincount()
     assert counts[counts > 0].min() > 512 / 4 * 0.7  # four concepts alike
     assert not torch.equal(plain.batch(0).concepts, even.batch(0).concepts)

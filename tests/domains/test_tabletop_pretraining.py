@@ -141,7 +141,6 @@ def test_pictures_are_looked_at_in_part_of_the_windows_alone(
     plan = {name: value.grad for name, value in module.raw.named_parameters() if value.grad is not None}
     assert any(name.startswith("denoiser") for name in plan)
     assert load_model(tmp_path / "model").config.training["model"]["told"] == 0.75
-    assert "told" not in PretrainingModule(privileged={PLACES: 1.0}, **SMALL).hparams
 
 
 def test_places_move_with_the_picture_and_what_has_none_is_also_seen_higher(data: PretrainingData) -> None:

@@ -18,7 +18,7 @@ from ftl_lightning.services.text import say
 from ftl_lightning.training.method import code_hash, load_method
 from ftl_lightning.version import __version__
 
-HASH = re.compile(r"[0-9a-f]{16}")
+HASH = re.compile(r"(\d+:)?[0-9a-f]{16}")
 NAME = re.compile(r"[\w .+()-]{1,60}")  # allowed names of methods
 ROUNDING = 2e-6  # tolerance for values rounded to six decimals
 ERRORS = 3  # tolerance of rates in standard errors on another machine, where learning amplifies rounding

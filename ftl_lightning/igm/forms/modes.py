@@ -66,7 +66,9 @@ class Modes(Shown):
         return Modes(embeddings, weights, mixed=self.mixed or other.mixed, stretch=max(self.stretch, other.stretch))
 
     def draw(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
-        """Draw modes or mixtures: embeddings ``(row, K, knots, n)``, weights ``(row, K)``, and the row of each sample ``(count,)``.
+        """Draw modes or mixtures of ``count`` samples with ``generator``.
+
+        Returns embeddings ``(row, K, knots, n)``, weights ``(row, K)``, and the row of each sample ``(count,)``.
 
         A mixture is ``mean + stretch * sum_m share_m (mode_m - mean)`` with shares uniform on the simplex (Dirichlet(1)).
         """

@@ -188,7 +188,7 @@ HOSTILE = [
     (b'{"kind": NaN}', "expected finite numbers, found nan"),
     (b'{"kind": "a", "kind": "b"}', "key 'kind': expected it once"),
     (b"[]", "content: expected a mapping"),
-    (b'{"method": "x"}', "key 'method': expected a value, found none"),
+    (b'{"method": "x"}', "key 'name': expected a value, found none"),
     (b'{"machine": {"processor": {"a": 1}}}', "key 'method': expected a value, found none"),
     (b"\xff\xfe\x00", "found damaged text"),
     (b'{"__class__": "os.system", "method": "x"}', "expected one of kind, format, method"),
