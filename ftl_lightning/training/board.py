@@ -103,6 +103,8 @@ class TrainingBar(ProgressBar):
         self._open.close()
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        if not pl_module.automatic_optimization:
+            return  # an inversion shows its gradient steps itself
         self._shown = trainer.global_step
         self._begin(getattr(trainer, "verb", "fit"), int(trainer.estimated_stepping_batches), self._shown)
 

@@ -21,7 +21,6 @@ from ftl_lightning.igm.settings import (
     WeightOptions,
 )
 from ftl_lightning.services.progress import bar
-from ftl_lightning.services.text import counted
 from ftl_lightning.services.validation import flat, groups_of
 from ftl_lightning.training.adaptation import Adaptation, LearnerAdaptation
 from ftl_lightning.training.concept_model import ConceptModel
@@ -91,7 +90,7 @@ class InversionModule(Adaptation):
             place = self.hparams["pretrained"], self.device
             return learned_in_processes(*place, self.demonstrations, self.settings, steps, self.processes)
         shown, interval = self.trainer.progress_bar_callback is not None, getattr(self.trainer, "log_every_n_steps", 50)
-        with bar(f"invert: {counted(len(self.concepts), 'concept')}", steps) if shown else nullcontext(lambda *_: None) as advance:
+        with bar("invert", steps) if shown else nullcontext(lambda *_: None) as advance:
 
             def tell(loss: float) -> None:
                 """Show the loss of a gradient step, and log it every ``trainer.log_every_n_steps`` steps."""
