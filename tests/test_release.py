@@ -74,7 +74,13 @@ def test_the_wheel_holds_every_file_of_the_package_and_nothing_else(released: Re
     assert inside - released.package == {record + name for name in RECORD}
     kinds = {".js", ".html", ".css", ".yaml", ".json", ".md", ".csv", ".safetensors", ".py", ".typed"}
     assert {Path(name).suffix for name in released.package} == kinds
-    some = ("py.typed", "conf/agent.yaml", "pretrained/strokes/model.safetensors", "domains/mocap/segments.csv", "play/page.js")
+    some = (
+        "py.typed",
+        "conf/agent.yaml",
+        "pretrained/strokes/model.safetensors",
+        "domains/mocap/segments.csv",
+        "apps/play/page.js",
+    )
     assert {f"ftl_lightning/{name}" for name in some} <= inside
 
 
