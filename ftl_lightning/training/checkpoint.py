@@ -123,6 +123,7 @@ def _is_whole(path: Path) -> bool:
 def last_checkpoint(trainer: pl.Trainer) -> Path | None:
     """The newest of the last checkpoints of the trainer's callbacks; ``None`` without any."""
     callbacks = [callback for callback in trainer.checkpoint_callbacks if isinstance(callback, ModelCheckpoint)]
+    # No public name: Lightning finds last checkpoints only while it resumes, too late to say that there is none.
     paths = [Path(path) for callback in callbacks for path in callback._find_last_checkpoints(trainer)]
     return max((path for path in paths if path.is_file()), key=lambda path: path.stat().st_mtime, default=None)
 

@@ -260,6 +260,7 @@ class Pretraining(pl.LightningModule, ABC, Generic[M]):
         decay = min(self.hparams["ema_decay"], self.global_step / (self.global_step + 10))
         if self.unused is None:
             with torch.no_grad():
+                # No public name: one kernel for all parameters, a tenth of the time of a loop.
                 torch._foreach_lerp_(list(self.model.parameters()), list(self.raw.parameters()), 1 - decay)
 
     def _evaluation_step(self, batch: Batch, name: str) -> None:
@@ -331,6 +332,7 @@ class Pretraining(pl.LightningModule, ABC, Generic[M]):
         checkpoint[SIGNATURE] = self.signature()
         place = f"training: step {self.global_step}"
         check_finite(checkpoint["state_dict"], place, "nothing was saved of it; lower the learning rate")
+        # No public name: whether a validation follows, which draws a random number before the next step.
         loop = self.trainer.fit_loop
         validates = not self._validated and loop.epoch_loop._should_check_val_fx(loop._data_fetcher)  # type: ignore[arg-type]
         Random.now(self.device, int(validates) + int(self.trainer.is_last_batch)).write(checkpoint)
