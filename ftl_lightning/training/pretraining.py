@@ -260,7 +260,7 @@ class Pretraining(pl.LightningModule, ABC, Generic[M]):
         decay = min(self.hparams["ema_decay"], self.global_step / (self.global_step + 10))
         if self.unused is None:
             with torch.no_grad():
-                # No public name: one kernel for all parameters, a tenth of the time of a loop.
+                # No public name: one call for all parameters instead of one for each.
                 torch._foreach_lerp_(list(self.model.parameters()), list(self.raw.parameters()), 1 - decay)
 
     def _evaluation_step(self, batch: Batch, name: str) -> None:
