@@ -272,15 +272,12 @@ def test_hparams_and_words_in_tables_are_what_a_person_chose_and_stand_with_the_
 
 
 @pytest.mark.slow
-def test_the_rate_of_each_step_is_a_curve(tiny: Path, invert: Callable[..., Path]) -> None:
+def test_the_rate_of_each_step_is_a_curve_and_so_is_the_loss_of_an_inversion(tiny: Path, invert: Callable[..., Path]) -> None:
     fitted = EventAccumulator(str(tiny.parent)).Reload()
     rates = [event.value for event in fitted.Scalars("optimizer/learning rate")]
     assert max(rates) > rates[-1] > 0  # cosine decay
-    options = ["--evaluation.suites=[]", "--model.omega=learned", "--model.budget.tolerance=null", "--model.weights.training=null"]
-    events = EventAccumulator(str(invert("--trainer.log_every_n_steps=1", *options))).Reload()
-    for name, first in (("embeddings", 0.1), ("weights", 0.003)):
-        rates = [event.value for event in events.Scalars(f"optimizer/learning rate/inversion.{name}")]
-        assert rates == pytest.approx([first * (1 + math.cos(math.pi * step / 5)) / 2 for step in range(5)], rel=1e-4)
+    events = EventAccumulator(str(invert("--trainer.log_every_n_steps=1", "--evaluation.suites=[]"))).Reload()
+    assert [event.step for event in events.Scalars("loss/train")] == [1, 2, 3, 4, 5]
 
 
 def test_demonstrations_are_drawn_above_the_samples_that_are_framed_by_outcome(tiny: Path) -> None:
