@@ -136,8 +136,13 @@ class ConceptModel(Shown, nn.Module, ABC):
         return learn(self, demonstrations, settings, steps, tell, watch, start)
 
     def read_concepts(self, demonstrations: Demonstrations) -> dict[str, Concept]:
-        """Concepts by name, made from demonstrations without gradient descent; required of models that are not invertible."""
-        raise NotImplementedError
+        """Concepts by name, made from demonstrations without gradient descent; required of models that are not invertible.
+
+        Raises:
+            UserError: for a model that does not define it.
+        """
+        name = self.method.name
+        raise UserError(f"model.pretrained: expected a model that learns or reads concepts, found one of {name}; mend its package")
 
     def check_settings(self, settings: InversionSettings) -> None:
         """Refuse settings that the model does not support; ``UserError`` with the key."""
@@ -192,7 +197,7 @@ class ConceptModel(Shown, nn.Module, ABC):
             draws: result of :meth:`draws`.
             loss: target of a diffusion model's squared error.
         """
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__}: an invertible model defines losses")
 
     @property
     def text_space(self) -> bool:

@@ -98,3 +98,10 @@ def test_a_model_without_parameters_is_pretrained_written_and_used_from_python(f
         model.learn(five, components=1)
     with pytest.raises(UserError, match="key 'embeddings': expected 16 numbers each, found 3"):
         model.learn(five, name="short")
+
+
+def test_a_model_that_neither_learns_nor_reads_concepts_is_one_line(fitted: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(Memory, "read_concepts")
+    model = FewShot(read_model(Memory, fitted), ModelSettings.read("conf/own.yaml"))
+    with pytest.raises(UserError, match=r"expected a model that learns or reads concepts, found one of memory; mend its package"):
+        model.learn(3 * np.ones((5, 8, 2), dtype=np.float32))
