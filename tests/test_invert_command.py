@@ -31,20 +31,22 @@ def file() -> Path:
 
 
 @pytest.mark.slow
-def test_it_writes_the_bytes_that_the_trainer_writes(model: Path, file: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_it_writes_and_prints_what_the_trainer_does(model: Path, file: Path, capfd: pytest.CaptureFixture[str]) -> None:
     options = ["--data.steps=5", "--model.form=paper", "--seed_everything=3", "--evaluation.samples=1", "--evaluation.steps=2"]
     options += ["--evaluation.figures=0", "--evaluation.diversity=false", *QUIET]
     trained = ["invert", f"--config={CONF / 'object_rearrangement.yaml'}", f"--model.pretrained={model}"]
     succeed(*trained, f"--data.demonstrations={file}", "--model.output=trained", *options)
-    capfd.readouterr()
+    by_trainer = capfd.readouterr().out.splitlines()
     succeed("invert", str(model), str(file), "--steps=5", "--form=paper", "--seed=3", "--out=own")
-    told = capfd.readouterr()
+    without = capfd.readouterr()
     names = sorted(path.name for path in Path("own").iterdir())
     assert len(names) == len(GOALS)
     for name in names:
         assert (Path("own") / name).read_bytes() == (Path("trained") / name).read_bytes()
-        assert f"own/{name}: loss " in told.out
-    assert "learning 2 concepts: 5 steps" in told.err
+    printed = without.out.splitlines()
+    assert [line.partition(":")[0] for line in printed[1::2]] == ["  quality"] * len(GOALS)
+    assert {line.replace("own/", "trained/") for line in printed} <= {*by_trainer}
+    assert "learning 2 concepts: 5 steps" in without.err
 
 
 def test_faults_of_demonstrations_are_noted(model: Path, capfd: pytest.CaptureFixture[str]) -> None:

@@ -14,8 +14,8 @@ from ftl_lightning.services.validation import LARGEST_STEP, check_count, check_r
 class InvertOptions:
     """Learn the concepts of a file of demonstrations through a pretrained model, without a trainer.
 
-    The concepts equal those of "invert --config" for the same file, with the settings of the model's domain. Nothing is
-    logged or evaluated.
+    Concepts and printed quality equal those of "invert --config" for the same file, with the settings of the model's domain.
+    Nothing is logged.
 
     Attributes:
         pretrained: folder of the pretrained model, or the name of a shipped model.
@@ -59,7 +59,7 @@ def invert(options: InvertOptions) -> None:
     for note in notes:
         say("note:", line(str(note.message)), error=True)
     for name, path in files.items():
-        write_concept(learned[name].concept, path)
+        write_concept(learned[name].concept, path, learned[name].inspection)
 
 
 def concepts(pretrained: str, folder: list[str] = [], plain: bool = False) -> None:  # noqa: B006 (never changed)

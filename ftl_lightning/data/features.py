@@ -137,7 +137,7 @@ def check_starts(starts: InitialStates | None) -> InitialStates:
     return starts
 
 
-def join(parts: Sequence[InitialStates]) -> InitialStates:
+def joined_starts(parts: Sequence[InitialStates]) -> InitialStates:
     """Concatenate initial states of several batches."""
     scenes = [part.scenes for part in parts if part.scenes is not None]
     return InitialStates(joined([part.observed for part in parts]), torch.cat(scenes) if scenes else None)

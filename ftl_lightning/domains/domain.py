@@ -35,6 +35,38 @@ _DERIVED: Any = None  # default of a field that is derived from other fields
 
 
 @dataclass(frozen=True)
+class View:
+    """Alternative representation of behaviour for a model; files and metrics keep the domain's representation.
+
+    Attributes:
+        features: features that the model observes, by name.
+        observe: conversion of the domain's observed features to these features.
+        encode: conversion of states to what the model generates: ``(states (sample, horizon, state), observed) -> (sample, horizon,
+            state)``.
+        decode: inverse of ``encode``; projects impossible generated states to the nearest possible ones.
+        perturb: augmentation in training, ``(states, observed, generator) -> (states, observed)`` with a slightly different present
+            state, from which a model learns to recover. Without a generator, it only hides what new tasks do not show. ``None`` for
+            none.
+        act: planner for plans in this view, as ``act`` of :class:`~ftl_lightning.domains.execution.ClosedLoop`; ``None`` for the
+            domain's planner.
+        scales: groups of columns of a state; columns at the same position in each group share a scale.
+        same_columns: whether encoded states have the same columns as the domain's states.
+        plane: columns of an encoded state that are x and y in the coordinates of observed points; a denoiser may rotate plans and
+            points together.
+    """
+
+    features: Mapping[str, Feature]
+    observe: Callable[[Observed], Observed]
+    encode: Callable[[Tensor, Observed], Tensor]
+    decode: Callable[[Tensor, Observed], Tensor]
+    perturb: Callable[[Tensor, Observed, torch.Generator | None], tuple[Tensor, Observed]] | None = None
+    act: Callable[[Tensor, int, Observed], Tensor] | None = None
+    scales: tuple[tuple[int, ...], ...] = ()
+    same_columns: bool = False
+    plane: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
 class Plans:
     """Behaviour to generate.
 
@@ -49,6 +81,7 @@ class Plans:
         groups: groups of columns by name, such as the legs of a body. A composition may restrict a concept to some groups.
         resolution: smallest variation of a column of states or observed vectors, in its unit; columns that vary by less count as
             constant.
+        views: alternative representations of behaviour for models, by name. A model without a view sees states as they are.
     """
 
     horizon: int
@@ -58,6 +91,7 @@ class Plans:
     resolution: float = 0.0
     at_rest: bool = True
     groups: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    views: Mapping[str, View] = field(default_factory=dict)
 
     def grouped(self, names: Sequence[str]) -> tuple[int, ...]:
         """Columns of groups; raises a ``UserError`` for an unknown name."""
@@ -187,38 +221,6 @@ class Metric:
 
 
 @dataclass(frozen=True)
-class View:
-    """Alternative representation of behaviour for a model; files and metrics keep the domain's representation.
-
-    Attributes:
-        features: features that the model observes, by name.
-        observe: conversion of the domain's observed features to these features.
-        encode: conversion of states to what the model generates: ``(states (sample, horizon, state), observed) -> (sample, horizon,
-            state)``.
-        decode: inverse of ``encode``; projects impossible generated states to the nearest possible ones.
-        perturb: augmentation in training, ``(states, observed, generator) -> (states, observed)`` with a slightly different present
-            state, from which a model learns to recover. Without a generator, it only hides what new tasks do not show. ``None`` for
-            none.
-        act: planner for plans in this view, as ``act`` of :class:`~ftl_lightning.domains.execution.ClosedLoop`; ``None`` for the
-            domain's planner.
-        scales: groups of columns of a state; columns at the same position in each group share a scale.
-        same_columns: whether encoded states have the same columns as the domain's states.
-        plane: columns of an encoded state that are x and y in the coordinates of observed points; a denoiser may rotate plans and
-            points together.
-    """
-
-    features: Mapping[str, Feature]
-    observe: Callable[[Observed], Observed]
-    encode: Callable[[Tensor, Observed], Tensor]
-    decode: Callable[[Tensor, Observed], Tensor]
-    perturb: Callable[[Tensor, Observed, torch.Generator | None], tuple[Tensor, Observed]] | None = None
-    act: Callable[[Tensor, int, Observed], Tensor] | None = None
-    scales: tuple[tuple[int, ...], ...] = ()
-    same_columns: bool = False
-    plane: tuple[int, ...] = ()
-
-
-@dataclass(frozen=True)
 class Privileged:
     """Quantity in training demonstrations that is not observed later, such as the positions of objects.
 
@@ -267,7 +269,6 @@ class Domain(Shown):
         metrics: measures of plans in open loop, by name; ablations report the first. Empty if behaviour is judged in closed loop
             only.
         closed_loop: execution of plans; ``None`` for a domain without an environment.
-        views: alternative representations of behaviour for models, by name. A model without a view sees states as they are.
         comparison: standards that results are compared with.
         recordings: recording and import of demonstrations, and what only those for training contain.
     """
@@ -280,7 +281,6 @@ class Domain(Shown):
     observed: Mapping[str, Feature] = field(default_factory=dict)
     metrics: Mapping[str, Metric] = field(default_factory=dict)
     closed_loop: ClosedLoop | None = None
-    views: Mapping[str, View] = field(default_factory=dict)
     comparison: Comparison = field(default_factory=Comparison)
     recordings: Recordings = field(default_factory=Recordings)
 

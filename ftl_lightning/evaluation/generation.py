@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.data.demonstrations import Demonstrations, concatenate
-from ftl_lightning.data.features import InitialStates, join, moved
+from ftl_lightning.data.features import InitialStates, joined_starts, moved
 from ftl_lightning.domains.domain import CLOSED, SUCCESS, Domain, closed_loop_of
 from ftl_lightning.domains.execution import Rollout
 from ftl_lightning.domains.tasks import EvaluationTask
@@ -279,7 +279,7 @@ def generate(
     for count in dict.fromkeys(counts.values()):
         batch = [task for task in compositions if counts[task] == count]
         noise = [generation.noise(task) for task in batch]
-        observed = join([where for task in batch if (where := starts[task]) is not None]).observed
+        observed = joined_starts([where for task in batch if (where := starts[task]) is not None]).observed
         together = [compositions[task] for task in batch]
         plans = model.sample(together, count, generation.sampling, noise, moved(observed, model.device)).cpu()
         for task, states in zip(batch, plans, strict=True):
@@ -310,7 +310,7 @@ def execute(module: Evaluable, judged: Sequence[TaskResult], generation: Generat
         UserError: for a domain without an environment.
     """
     model, domain, loop = module.model, module.domain, closed_loop_of(module.domain)
-    starts = join([behaviour.starts for behaviour in judged if behaviour.starts is not None])
+    starts = joined_starts([behaviour.starts for behaviour in judged if behaviour.starts is not None])
     compositions = _compositions(module, (behaviour.task for behaviour in judged))
     counts = [len(behaviour.states) for behaviour in judged]
     episodes = [(behaviour.task, episode) for behaviour in judged for episode in range(len(behaviour.states))]

@@ -34,7 +34,7 @@ def demonstrations_of(
     """
     if isinstance(states, Demonstrations):
         check_of_domain("states", states, domain)
-        return states.fitted(domain.observed).named(name)
+        return states.named(name).fitted(domain.observed)
     whole, lengths = _padded("states", states)
     columns = len(domain.plans.columns)
     if whole.dim() != 3 or whole.shape[2] != columns:

@@ -65,9 +65,16 @@ class LearnedConcept(Composition):
         Raises:
             UserError: for a concept that was not learned in this process from two demonstrations or more.
         """
-        if self.demonstrations is None or self.judging is None or len(self.demonstrations) < 2:
+        if self.inspection is None:
             raise UserError("quality: expected a concept that was learned here from two demonstrations or more, found another")
-        return inspected(self.model, self.judging, self.demonstrations, self.concept, 0)
+        return self.inspection
+
+    @functools.cached_property
+    def inspection(self) -> Inspection | None:
+        """:attr:`quality`; ``None`` where it cannot be measured."""
+        if self.demonstrations is None or self.judging is None:
+            return None
+        return inspected(self.model, self.judging, self.demonstrations, self.concept)
 
     def explain(self, nearest: int = 3) -> Explanation:
         """Explain the weighted sum, averaged over knots, by training concepts.
@@ -110,8 +117,7 @@ class LearnedConcept(Composition):
     @property
     def _judged(self) -> Concept:
         """The concept with its quality, if measurable."""
-        measurable = self.demonstrations is not None and self.judging is not None and len(self.demonstrations) > 1
-        return replace(self.concept, quality=self.quality.record) if measurable else self.concept
+        return self.concept if self.inspection is None else replace(self.concept, quality=self.inspection.record)
 
     def save_pretrained(self, folder: str | Path, demonstrations: bool = False) -> None:
         """Write a folder to share: ``concept.safetensors`` with its quality, a film or picture of new samples, and a

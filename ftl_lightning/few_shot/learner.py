@@ -45,7 +45,7 @@ from ftl_lightning.services.shipped import pretrained_folder, shipped_models, sh
 from ftl_lightning.services.text import Shown
 from ftl_lightning.services.trust import vouching
 from ftl_lightning.services.validation import LARGEST_STEP, changed, check_path, check_text, check_whole, device_named
-from ftl_lightning.training.checks import Check, check_concept, check_sizes, check_with, notes_of
+from ftl_lightning.training.checks import Check, check_concept, check_with, notes_of
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.hub import CONCEPT_FILES, download, is_repository, save_with_card, upload
 from ftl_lightning.training.model_folder import load_model
@@ -306,7 +306,8 @@ class FewShot(Shown):
         Raises:
             UserError: if demonstrations or settings do not fit the model.
         """
-        fitted = of_one_concept(self.demonstrations(states, observed, name))
+        check_text("name", name, "go to red bowl")
+        fitted = of_one_concept(demonstrations_of(self.domain, states, observed, name))
         (learned,) = self._learn(fitted, "learn", steps, seed, progress, watch, changes)
         return learned
 
@@ -365,9 +366,7 @@ class FewShot(Shown):
         watched = None if watch is None else self._watched(names[0], watch)
         with bar(title, total) if progress else nullcontext(lambda *_: None) as advance:
             learned = self.model.learn_concepts(fitted, settings, total, lambda loss: advance(1, f"loss {loss:.3g}"), watched)
-        for name in names:
-            check_sizes(self.model, learned[name])
-            self._examples.append(fitted.select(name))
+        self._examples += [fitted.select(name) for name in names]
         judging = self.judging
         return [replace(self._learned(learned[name]), demonstrations=fitted.select(name), judging=judging) for name in names]
 

@@ -220,7 +220,7 @@ def _paired(domain: Domain, rows: pd.DataFrame) -> Table:
         f"{domain.name}: {compared} less that of policies from the same starts, 95 % interval, McNemar's exact p "
         f"(of these learned concepts: the episodes of a seed share one){elsewhere}"
     )
-    return make_table(domain, "paired", caption, lines, ["setting", "method", "compared with", "difference"])
+    return make_table(None, "paired", caption, lines, ["setting", "method", "compared with", "difference"])
 
 
 def _ablation(domain: Domain, name: str, caption: str, ours: pd.DataFrame, column: str) -> Table:

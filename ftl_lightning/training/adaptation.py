@@ -155,12 +155,9 @@ class Adaptation(pl.LightningModule, ABC):
 
     def _quality(self, name: str, concept: Concept) -> Inspection | None:
         """Quality of the samples of a user's concept, also drawn into TensorBoard; ``None`` if it cannot be measured."""
-        demonstrations = self.demonstrations.select(name)
-        if len(demonstrations) < 2 or self.model.config.horizon != self.domain.plans.horizon:  # some methods plan a step at a time
-            return None
-        inspection = inspected(self.model, self.domain, demonstrations, concept, self.hparams["seed"])
-        for logger in self.trainer.loggers:
-            if isinstance(logger, TensorBoardLogger):
+        inspection = inspected(self.model, self.domain, self.demonstrations.select(name), concept)
+        for logger in self.trainer.loggers if inspection else ():
+            if inspection and isinstance(logger, TensorBoardLogger):
                 tag = f"quality/{file_name(name)}"
                 logger.experiment.add_figure(tag, inspection.figure(), self.trainer.global_step)
                 logger.experiment.add_text(tag, str(inspection), self.trainer.global_step)

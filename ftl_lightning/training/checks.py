@@ -15,7 +15,7 @@ from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.igm.forms.leave_one_out import LeaveOneOut, leave_one_out, relative_losses
 from ftl_lightning.igm.settings import InversionSettings
-from ftl_lightning.services.errors import UserError, about, require, short
+from ftl_lightning.services.errors import about, require, short
 from ftl_lightning.services.progress import bar
 from ftl_lightning.services.text import counted
 from ftl_lightning.training.concept_model import ConceptModel
@@ -217,15 +217,10 @@ def _scale(model: ConceptModel, demonstrations: Demonstrations) -> Iterator[Find
     named = view is None or view.same_columns
     names = columns if named and len(columns) == len(values) else [f"{column} of the model's view" for column in range(len(values))]
     yield from _range_finding("states", values, names)
-    if model.initial_normalization is not None:
-        try:
-            seen = model.vector(moved(demonstrations.initial_states.observed, model.device))
-        except UserError:  # reported elsewhere
-            return
-        if seen is not None:
-            size = len(model.initial_normalization.low)
-            vectors = seen[:, :size].abs().T.cpu()
-            yield from _range_finding("observed vectors", vectors, [f"number {number}" for number in range(size)])
+    vectors = model.vectors(moved(demonstrations.initial_states.observed, model.device))
+    if vectors is not None:
+        numbers = [f"number {number}" for number in range(vectors.shape[1])]
+        yield from _range_finding("observed vectors", vectors.abs().T.cpu(), numbers)
     if named and len(columns) == len(values):
         low, high = model.normalization.low.cpu(), model.normalization.high.cpu()
         every = torch.cat([states[:length] for states, length in zip(demonstrations.states, demonstrations.lengths, strict=True)])

@@ -287,12 +287,19 @@ class ConceptModel(Shown, nn.Module, ABC):
             return None
         seen = self._seen(observed)
         parts = []
-        if self.initial_normalization is not None:
-            vectors = self.initial_normalization.encode(joined_vectors(seen, self.config.observed))
+        if (vectors := self._vectors(seen)) is not None:
             parts.append(self._dropped(vectors) if self.training else vectors)
         if self.images is not None:
             parts.append(self.images.from_origins(observed[READ] if READ in observed else self.images(seen), seen))
         return torch.cat(parts, dim=-1)
+
+    def vectors(self, observed: Observed) -> Tensor | None:
+        """Normalised observed vectors ``(batch, m)``, without image encodings; ``None`` without any."""
+        return None if self.initial_normalization is None else self._vectors(self._seen(observed))
+
+    def _vectors(self, seen: Observed) -> Tensor | None:
+        normalization = self.initial_normalization
+        return None if normalization is None else normalization.encode(joined_vectors(seen, self.config.observed))
 
     def of_images(self, observed: Observed) -> Tensor | None:
         """Image encodings ``(batch, n)``, for methods that encode images once and vectors often; ``None`` without images."""

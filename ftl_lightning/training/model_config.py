@@ -64,9 +64,9 @@ def find_view(domain: Domain, name: str) -> View | None:
     """A domain's view by name; ``None`` for the empty name; ``UserError`` for an unknown name."""
     if not name:
         return None
-    if name not in domain.views:
-        raise UserError(f"model.view: expected one of {', '.join(map(repr, ('', *domain.views)))}, found {short(name)!r}")
-    return domain.views[name]
+    if name not in domain.plans.views:
+        raise UserError(f"model.view: expected one of {', '.join(map(repr, ('', *domain.plans.views)))}, found {short(name)!r}")
+    return domain.plans.views[name]
 
 
 def read_config(folder: str | Path) -> dict[str, Any]:

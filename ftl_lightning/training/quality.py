@@ -105,15 +105,20 @@ class Inspection:
         return beside(self.domain.show, demonstrations, samples, f"{self.name}: {self}")
 
 
-def inspected(model: ConceptModel, domain: Domain, demonstrations: Demonstrations, concept: Concept, seed: int) -> Inspection:
-    """Inspect samples of a learned concept.
+def inspected(model: ConceptModel, domain: Domain, demonstrations: Demonstrations, concept: Concept) -> Inspection | None:
+    """Inspect samples of a learned concept, with the same noise for every seed of learning.
 
     Args:
         domain: domain whose first success metric judges samples, if it can read the concept's name.
-        demonstrations: two or more demonstrations of the concept.
+        demonstrations: demonstrations of the concept.
+
+    Returns:
+        Inspection; ``None`` for a single demonstration, or a model whose plans are shorter than the domain's.
     """
+    if len(demonstrations) < 2 or model.horizon != domain.plans.horizon:
+        return None
     name = concept.origin.name
-    samples, starts = generated(model, demonstrations, {name: concept}, seed)
+    samples, starts = generated(model, demonstrations, {name: concept}, seed=0)
     plans, (known, first) = samples[name], first_windows(demonstrations, model.config.horizon)
     right = None
     if domain.concepts.reads(name):

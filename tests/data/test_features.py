@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from ftl_lightning.data.features import Feature, InitialStates, check_features, check_starts, join, joined, moved, take
+from ftl_lightning.data.features import Feature, InitialStates, check_features, check_starts, joined, joined_starts, moved, take
 from ftl_lightning.services.errors import UserError
 
 
@@ -50,16 +50,16 @@ def test_initial_states_are_counted_by_what_there_is_and_are_taken_and_joined() 
     )
     assert [len(one) for one in some] == [0, 3, 4, 3]
     one, other = InitialStates(observed(2), torch.zeros(2, 4)), InitialStates(observed(1, 9.0), torch.ones(1, 4))
-    both = join([one, other])
+    both = joined_starts([one, other])
     assert len(both) == 3
     last = both.take(slice(2, 3))
     assert last.observed["place"].tolist() == [[9, 10]]
     assert last.require_scenes().tolist() == [[1, 1, 1, 1]]
     assert both.take([2, 0]).require_scenes()[:, 0].tolist() == [1, 0]
-    unseen = join([InitialStates(observed(1)), InitialStates(observed(1))])
+    unseen = joined_starts([InitialStates(observed(1)), InitialStates(observed(1))])
     assert unseen.scenes is None
     assert unseen.take([0]).scenes is None
-    assert len(join([])) == 0
+    assert len(joined_starts([])) == 0
 
 
 def test_scenes_and_initial_states_that_are_missing_are_told_where_nothing_goes_without() -> None:

@@ -138,6 +138,9 @@ def test_paired_episodes_have_a_line_for_each_policy_in_each_environment(tmp_pat
     assert cells["compared with"].tolist() == ["FASTER", "FASTER (step veto)"]
     assert set(cells["method"]) == {"FTL-IGM (free)"}
     assert [cell.split(" ")[0] for cell in cells["difference"]] == ["+0.10", "-0.40"]
+    unpublished = replace(driving, comparison=replace(driving.comparison, paper=None))
+    cells = next(table.cells for table in tables(unpublished, read_rows(tmp_path / "r.csv")) if table.name == "paired")
+    assert [cell.split(" ")[0] for cell in cells["difference"]] == ["+0.10", "-0.40"]
 
 
 def test_settings_of_ones_own_come_last_and_components_apart(tmp_path: Path) -> None:

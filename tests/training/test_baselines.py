@@ -105,7 +105,7 @@ def test_a_plan_that_no_state_can_be_unrolled_from_is_refused() -> None:
 def test_the_view_in_steps_goes_there_and_back_and_short_windows_start_anywhere_long_ones_early() -> None:
     drives = DOMAIN.source(None).draw("go to bowl", 2, 0)
     states, initial = drives.windows(torch.tensor([0, 1]), torch.tensor([0, 7]), 16)
-    view = DOMAIN.views["steps"]
+    view = DOMAIN.plans.views["steps"]
     steps = view.encode(states, initial)
     assert torch.allclose(steps[:, 0], torch.zeros(2, 13), atol=1e-6)
     assert torch.allclose(steps[:, 3], states[:, 3] - states[:, 2])

@@ -208,7 +208,7 @@ def distance(states: Tensor, others: Tensor) -> Tensor:
 
 DOMAIN = Domain(
     name=traffic.NAME,
-    plans=Plans(traffic.HORIZON, traffic.STATE_NAMES, traffic.STATE_UNITS, resolution=1e-3),
+    plans=Plans(traffic.HORIZON, traffic.STATE_NAMES, traffic.STATE_UNITS, resolution=1e-3, views=VIEWS),
     concepts=Concepts(
         training=traffic.TRAINING_CONCEPTS,
         suites=traffic.SUITES,
@@ -219,7 +219,6 @@ DOMAIN = Domain(
     source=Expert,
     observed=traffic.FEATURES_SEEN,
     show=Show(deferred(f"{RENDERING}:render"), vector_film=deferred(f"{RENDERING}:plan_film")),
-    views=VIEWS,
     closed_loop=ClosedLoop(
         environment=environment,
         identity=f"{traffic.BELIEF} veto",

@@ -115,7 +115,7 @@ def _frozen(goal: str, count: int, starts: InitialStates | None, seed: int) -> T
 
 DOMAIN = Domain(
     name=NAME,
-    plans=Plans(HORIZON, COLUMNS, ("m",) * len(COLUMNS), resolution=1e-3, at_rest=False, groups=GROUPS),
+    plans=Plans(HORIZON, COLUMNS, ("m",) * len(COLUMNS), resolution=1e-3, at_rest=False, groups=GROUPS, views=VIEWS),
     concepts=Concepts(
         training=TRAINING_CONCEPTS,
         suites=SUITES | {"training": training_suite(tuple(text for text in TRAINING_CONCEPTS if action(text) in TESTED))},
@@ -131,7 +131,6 @@ DOMAIN = Domain(
         "bone error": Metric(deferred(f"{_MEASURES}:bone_error"), less_is_better=True),
         "jerk": Metric(deferred(f"{_MEASURES}:jerk"), less_is_better=True),
     },
-    views=VIEWS,
     show=Show(
         deferred(f"{_DRAWING}:picture"),
         deferred(f"{_DRAWING}:film"),

@@ -126,12 +126,11 @@ _LOOP = ClosedLoop(
 )
 DOMAIN = Domain(
     name=interface.NAME,
-    plans=Plans(HORIZON, interface.STATE_NAMES, interface.STATE_UNITS, resolution=1e-4),
+    plans=Plans(HORIZON, interface.STATE_NAMES, interface.STATE_UNITS, resolution=1e-4, views=interface.VIEWS),
     concepts=Concepts(interface.TRAINING_CONCEPTS, interface.SUITES, table=_FOLDER / "embeddings.safetensors"),
     source=source,
     observed=interface.FEATURES,
     recordings=Recordings(privileged={interface.PLACES: Privileged(interface.SEEN, interface.misplaced, interface.told)}),
-    views=interface.VIEWS,
     show=Show(deferred(f"{RENDERING}:render"), vector_film=deferred(f"{RENDERING}:plan_film")),
     closed_loop=_LOOP,
     comparison=Comparison(
