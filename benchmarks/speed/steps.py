@@ -17,8 +17,8 @@ from ftl_lightning.few_shot.tuned import ModelSettings, settings_of
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.diffusion import add_noise, clean_from_epsilon, cosine_alpha_bar, denoising_loss
 from ftl_lightning.igm.guidance import composed_epsilon
-from ftl_lightning.igm.inversion import Adam
-from ftl_lightning.igm.samplers import timesteps
+from ftl_lightning.igm.optimizer import Adam
+from ftl_lightning.igm.samplers import sampler_timesteps
 from ftl_lightning.methods.ftl_igm.model import DiffusionConfig, GenerativeModel, build_denoiser
 from ftl_lightning.networks import PAPER_SIZE
 from ftl_lightning.networks.image_encoder import RESNET18, ImageEncoders
@@ -157,7 +157,7 @@ def made(step: Step, device: str = "cpu") -> Made:
         composition = Composition(embeddings, torch.ones(step.concepts, step.components))
     if step.kind == "sampling":
         context = observed()
-        before, now = timesteps(config.diffusion_steps, 3)[:2]
+        before, now = sampler_timesteps(config.diffusion_steps, 3)[:2]
 
         @torch.no_grad()
         def denoise() -> None:

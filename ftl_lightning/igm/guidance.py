@@ -1,6 +1,4 @@
-"""The composed denoiser, Eq. 2 of the paper, for learning, sampling and composing."""
-
-from typing import NamedTuple
+"""The composed denoiser (Eq. 2 of the paper), used to learn, sample and compose concepts."""
 
 import torch
 from torch import Tensor
@@ -18,20 +16,23 @@ def composed_epsilon(
     context: Context = (),
     row: Tensor | None = None,
 ) -> Tensor:
-    """``eps(x, empty) + sum_k w_k (eps(x, c_k) - eps(x, empty))``, with all branches in a single forward pass.
+    """Composed noise estimate ``eps(x, empty) + sum_k w_k (eps(x, c_k) - eps(x, empty))`` (Eq. 2).
 
-    With gradients enabled, the unconditional branch ``eps(x, empty)`` is evaluated separately and without gradient. The branch of
-    a concept with an adapter is evaluated by the modified denoiser; an adapter with ``everywhere`` also modifies the unconditional
-    branch and the branches of its composition without an adapter.
+    A *branch* is the noise estimate of every sample under one embedding: the unconditional branch ``eps(x, empty)``, and K
+    conditional branches ``eps(x, c_k)``. All K + 1 branches are a single forward pass. With gradients enabled, the unconditional
+    branch is a separate pass without gradient, since it depends on no learned parameter.
+
+    An adapter modifies the denoiser in the branch of its concept. An adapter with ``everywhere`` also modifies the unconditional
+    branch, and those branches of its composition that have no adapter. Each adapter then needs a separate forward pass.
 
     Args:
         denoiser: noise estimate with a single concept per sample.
         x: noisy plans ``(batch, horizon, state)``.
-        t: timesteps ``(batch,)``.
-        composition: ``(composition, K, ...)``; K may be 0.
+        t: timesteps ``(batch,)`` int64.
+        composition: batch of compositions, weights ``(composition, K)``; K may be 0.
         empty: unconditional embedding ``(n,)``.
-        context: context of each sample.
-        row: composition of each sample ``(batch,)`` int64; ``None`` for equally sized consecutive groups.
+        context: encoded observed features of each sample, such as the initial state ``s_0``.
+        row: index of each sample's composition ``(batch,)`` int64; ``None`` for groups of equal size, in order.
 
     Returns:
         ``(batch, horizon, state)``.
@@ -39,72 +40,51 @@ def composed_epsilon(
     count, components = composition.weights.shape
     if row is None:
         row = torch.arange(count, device=x.device).repeat_interleave(len(x) // count)
-    noised, concepts = Noised(x, t, context), composition.embeddings.flatten(0, 1)
-    index = components * row + torch.arange(components, device=row.device)[:, None]  # (K, batch): rows of the concepts
+    concepts = composition.embeddings.flatten(0, 1)
+    index = components * row + torch.arange(components, device=row.device)[:, None]  # (K, batch): each branch's row of concepts
     empty, first = empty.repeat(1, composition.knots, 1), torch.zeros_like(row)[None]
-    if not (composition.adapters or (torch.is_grad_enabled() and len(index))):
-        every = branches(denoiser, noised, torch.cat((empty, concepts)), torch.cat((first, index + 1)))
-        unconditional, conditional = every[0], every[1:]
-        return unconditional + weighted_sum(composition, row, conditional - unconditional)
-    unadapted, adapted, everywhere = denoiser, denoiser, torch.zeros(1, dtype=torch.bool)
     if composition.adapters:
-        number, everywhere = _adapter_numbers(composition, row)
-        adapted = _by_adapter(denoiser, composition, number.T.flatten())
-        unadapted = _by_adapter(denoiser, composition, everywhere)
-    if everywhere.any():
-        unconditional = branches(unadapted, noised, empty, first)[0]
-    else:
+        number, default = _adapter_numbers(composition, row)
+        if default.any():
+            unconditional = branches(_by_adapter(denoiser, composition, default), x, t, empty, first, context)[0]
+        else:
+            with torch.no_grad():
+                unconditional = branches(denoiser, x, t, empty, first, context)[0]
+        conditional = branches(_by_adapter(denoiser, composition, number.T.flatten()), x, t, concepts, index, context)
+    elif torch.is_grad_enabled() and components:
         with torch.no_grad():
-            unconditional = branches(denoiser, noised, empty, first)[0]
-    conditional = branches(adapted, noised, concepts, index)
+            unconditional = branches(denoiser, x, t, empty, first, context)[0]
+        conditional = branches(denoiser, x, t, concepts, index, context)
+    else:
+        estimates = branches(denoiser, x, t, torch.cat((empty, concepts)), torch.cat((first, index + 1)), context)
+        unconditional, conditional = estimates[0], estimates[1:]
     return unconditional + weighted_sum(composition, row, conditional - unconditional)
 
 
-class Noised(NamedTuple):
-    """Noisy plans.
-
-    Attributes:
-        x: noisy plans ``(batch, horizon, state)``.
-        t: timesteps ``(batch,)``.
-        context: encoded observed features of each plan.
-    """
-
-    x: Tensor
-    t: Tensor
-    context: Context
-
-    def repeated(self, count: int) -> "Noised":
-        """Tile the batch ``count`` times."""
-        context = tuple(part.repeat(count, *(1,) * (part.dim() - 1)) for part in self.context)
-        return Noised(self.x.repeat(count, 1, 1), self.t.repeat(count), context)
-
-    def at(self, samples: Tensor) -> "Noised":
-        """Select plans by index ``(sample,)``."""
-        return Noised(self.x[samples], self.t[samples], tuple(part[samples] for part in self.context))
-
-
-def branches(denoiser: Denoiser, noised: Noised, concepts: Tensor, index: Tensor) -> Tensor:
-    """Estimate the noise of every plan in every branch, in a single forward pass.
+def branches(denoiser: Denoiser, x: Tensor, t: Tensor, concepts: Tensor, index: Tensor, context: Context) -> Tensor:
+    """Estimate the noise of every plan in every branch, in a single forward pass over ``branch * batch`` samples.
 
     Args:
         denoiser: noise estimate with a single concept per sample.
-        concepts: ``(concept, knots, n)``.
+        x, t, context: noisy plans, timesteps and encoded observed features ``(batch, ...)``.
+        concepts: embeddings ``(concept, knots, n)``.
         index: row of ``concepts`` for each branch and plan ``(branch, batch)`` int64.
 
     Returns:
         ``(branch, batch, horizon, state)``.
     """
-    x, t, context = noised.repeated(len(index))
+    x, t = x.repeat(len(index), 1, 1), t.repeat(len(index))
+    context = tuple(part.repeat(len(index), *(1,) * (part.dim() - 1)) for part in context)
     return denoiser(x, t, concepts, index.flatten(), context).unflatten(0, index.shape)
 
 
 def weighted_sum(composition: Composition, row: Tensor, differences: Tensor) -> Tensor:
-    """``sum_k w_k differences_k`` with weights that may differ between the columns of a state.
+    """Weighted sum ``sum_k w_k differences_k``; a weight may differ between the columns (dimensions) of a state.
 
     Args:
-        composition: ``(composition, K, ...)``.
-        row: composition of each sample ``(batch,)``.
-        differences: ``(K, batch, horizon, state)``.
+        composition: batch of compositions, weights ``(composition, K)``.
+        row: index of each sample's composition ``(batch,)`` int64.
+        differences: ``eps(x, c_k) - eps(x, empty)``, ``(K, batch, horizon, state)``.
 
     Returns:
         ``(batch, horizon, state)``.
@@ -116,15 +96,15 @@ def weighted_sum(composition: Composition, row: Tensor, differences: Tensor) -> 
 
 
 def _adapter_numbers(composition: Composition, row: Tensor) -> tuple[Tensor, Tensor]:
-    """Adapter of each plan's concepts ``(batch, K)``, and of its unconditional branch ``(batch,)``, from 1; 0 for none."""
+    """Adapter of each sample's conditional branches ``(batch, K)`` and unconditional branch ``(batch,)``, from 1; 0 for none."""
     number = composition.adapter_number[row]
-    numbered = enumerate(composition.adapters, start=1)
-    default = number.new_tensor([0, *(place * adapter.everywhere for place, adapter in numbered)])[number].amax(dim=1)
+    everywhere = [position * adapter.everywhere for position, adapter in enumerate(composition.adapters, start=1)]
+    default = number.new_tensor([0, *everywhere])[number].amax(dim=1)
     return torch.where(number == 0, default[:, None], number), default
 
 
 def _by_adapter(denoiser: Denoiser, composition: Composition, number: Tensor) -> Denoiser:
-    """Denoiser that applies adapter ``number (sample,)`` to each sample, from 1; 0 for none. One forward pass per adapter."""
+    """Denoiser that applies to each sample the adapter ``number (sample,)``, from 1; 0 for none. One forward pass per adapter."""
 
     def estimate(x: Tensor, t: Tensor, concepts: Tensor, index: Tensor, context: Context) -> Tensor:
         by_number = number.argsort(stable=True)
@@ -132,9 +112,9 @@ def _by_adapter(denoiser: Denoiser, composition: Composition, number: Tensor) ->
         noise = []
         for adapter, samples in zip((None, *composition.adapters), groups, strict=True):
             if len(samples):
-                changed = denoiser if adapter is None else adapter(denoiser)
-                some = Noised(x, t, context).at(samples)
-                noise.append(changed(some.x, some.t, concepts, index[samples], some.context))
+                adapted = denoiser if adapter is None else adapter(denoiser)
+                features = tuple(part[samples] for part in context)
+                noise.append(adapted(x[samples], t[samples], concepts, index[samples], features))
         return torch.cat(noise)[by_number.argsort()]
 
     return estimate

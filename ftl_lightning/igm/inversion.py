@@ -1,6 +1,14 @@
-"""Inversion: gradient descent on concept embeddings and weights through the frozen model (Eq. 2 of the paper)."""
+"""Inversion: learning concepts from demonstrations by gradient descent through the frozen model (section 4.2 of the paper).
 
-import math
+For each new concept, the embeddings ``c_1 .. c_K`` and the guidance weights ``w_1 .. w_K`` minimise Eq. 2 of the paper,
+
+    ``E_{tau, t, eps} |eps - (eps_theta(x_t, empty) + sum_k w_k (eps_theta(x_t, c_k) - eps_theta(x_t, empty)))|^2``,
+
+where tau is a window of a demonstration and ``x_t`` is tau with noise eps of timestep t. A *run* learns one set of K embeddings
+from one initial value. A concept has a run on all its demonstrations and, if the settings ask for modes, a run on a part of them
+for each *mode*. *Restarts* repeat each of these runs with other initial values. All runs of all concepts are learned in one batch.
+"""
+
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
@@ -9,28 +17,29 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
-from torch.optim.adam import adam
 
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.igm.forms.adapter import LowRank
-from ftl_lightning.igm.forms.modes import Modes
+from ftl_lightning.igm.forms.modes import Modes, explained
 from ftl_lightning.igm.forms.stopping import Stopping
 from ftl_lightning.igm.model import Invertible
+from ftl_lightning.igm.optimizer import Adam
 from ftl_lightning.igm.settings import CONCEPTS, EXPLAINED, REDUCED, InversionSettings
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.randomness import generator, task_key
 
-FINAL_SAMPLES = 128
-"""Number of noised demonstrations for the final loss, the same for all restarts."""
-HELD_OUT = 32
-"""Number of noised demonstrations for the stopping loss."""
+FINAL_SAMPLES, HELD_OUT_SAMPLES = 128, 32
+"""Noised windows per run for the final loss, which selects a restart, and for the held-out loss, which stops and screens runs."""
+START, STEP, FINAL, HELD_OUT = range(4)
+"""Random streams, the second number of a generator's key: initial values, gradient steps, final loss, held-out loss."""
 
 Tell = Callable[[float], None]
-"""Callback after a gradient step with its mean loss."""
+"""Callback after a gradient step: receives the mean loss of the active runs."""
 Watch = Callable[[int, float, Callable[[], dict[str, Concept]]], None]
-"""Callback after a gradient step: the step's number from 1, its mean loss, and a function that returns the concepts so far."""
+"""Callback after a gradient step: receives the number of the step from 1, the mean loss of the active runs, and a function that
+returns the current concepts by name."""
 
 
 def invert(
@@ -42,47 +51,49 @@ def invert(
     watch: Watch | None = None,
     start: "Inversion | None" = None,
 ) -> dict[str, Concept]:
-    """Learn the embeddings and weights of every concept of the demonstrations, in one batch.
+    """Learn all concepts of the demonstrations in one batch (Eq. 2).
 
     Args:
-        demonstrations: demonstrations; their concept texts name the concepts.
-        steps: maximum number of gradient steps.
-        tell, watch: callbacks after each step; reading the concepts so far changes nothing.
-        start: initial parameters, which are changed; ``None`` to create them.
+        model: frozen model.
+        demonstrations: demonstrations; ``demonstrations.concepts`` names the concept of each.
+        settings: settings of the inversion.
+        steps: maximum number of gradient steps; without early stopping the learning rates decay to 0 over them.
+        tell, watch: callbacks after each gradient step; they do not affect the result.
+        start: initial parameters, optimised in place; ``None`` for new ones.
 
     Returns:
         Concepts by name.
 
     Raises:
-        UserError: if a loss is not finite, or the model does not support the settings.
+        UserError: if a loss or a concept is not finite, or if the model does not support the settings.
     """
     inversion = Inversion(model, demonstrations, settings).to(model.device) if start is None else start
     optimizers = [Adam(parameter, rate) for parameter, rate in inversion.rates]
-    decay = steps if settings.budget.tolerance is None else None
+    decay_steps = steps if settings.budget.tolerance is None else None
     for step in range(steps):
         losses = inversion.step_losses(step)
-        # The sum over runs: runs do not affect each other's gradients. Adapter factors of the condition encoder, which is evaluated
-        # once per plan, may have no gradient.
+        # The gradient of the sum holds the gradient of each run, whose loss depends on no other run. The condition encoder is
+        # evaluated without adapter: the adapter factors of its weights get zero gradients.
         parameters = [optimizer.parameter for optimizer in optimizers]
         gradients = torch.autograd.grad(losses.sum(), parameters, materialize_grads=True)
         for optimizer, gradient in zip(optimizers, gradients, strict=True):
-            optimizer.step(gradient, step, decay)
+            optimizer.step(gradient, step, decay_steps)
         loss = losses.detach().mean().item()
         tell(loss)
         if watch is not None:
             watch(step + 1, loss, inversion.learned)
-        if not inversion.stepped(step):
+        if not inversion.after_step(step):
             break
     return inversion.learned()
 
 
 class Run(NamedTuple):
-    """A restart of one set of embeddings.
+    """Optimisation of one set of K embeddings from one initial value.
 
     Attributes:
-        concept: index of the concept.
-        rows: rows of its demonstrations.
-        mode: number of the mode from 1; 0 for the set that is learned from all demonstrations of the concept.
+        concept: index of the concept in :attr:`Inversion.concepts`.
+        rows: rows of the demonstrations that the run learns from.
+        mode: number of the mode from 1; 0 for a run on all demonstrations of the concept.
     """
 
     concept: int
@@ -91,66 +102,62 @@ class Run(NamedTuple):
 
 
 class Inversion(nn.Module):
-    """Parameters of an inversion: K embeddings and guidance weights for every concept, in one batch.
+    """Parameters and losses of an inversion, with all runs in one batch.
 
-    Parameters: ``embeddings (run, K, knots, n)``; ``weights (run, K)`` unless omega is fixed; the adapter's factors for each
-    concept and restart. A run is a restart of a concept or of a mode. Modes use their concept's adapter without changing it.
+    Each restart of a concept has a low-rank adapter of the denoiser, if the settings ask for one. The run on all demonstrations
+    learns the adapter; the modes use the adapter without learning it. The paper's form has neither modes nor adapter, and 1 knot.
 
     Args:
-        model: the frozen model, which is not a submodule.
-        demonstrations: demonstrations; their concept texts name the concepts to learn.
-        settings: settings of the inversion.
+        model, demonstrations, settings: see :func:`invert`.
+
+    Attributes:
+        embeddings: parameter ``(run, K, knots, n)``; a component has one embedding at each of ``knots`` times of the plan.
+        weights: guidance weights ``(run, K)``; a parameter if omega is ``'learned'``, else constant.
+        factors: parameters of the adapters ``(adapter, ...)``, a pair for each adapted weight of the denoiser.
+        concepts, runs: names of the concepts, and the runs, ordered by concept, mode, restart.
+        basis: orthonormal basis of the span of the training embeddings ``(rank, n)``.
+        is_mode, kept: masks of the runs that learn a mode, and of those that are not screened out ``(run,)``.
+        stopping: rule of early stopping; ``None`` without early stopping.
 
     Raises:
         UserError: if the model does not support the settings.
     """
 
-    basis: Tensor
+    model: Invertible
     weights: Tensor
+    basis: Tensor
     is_mode: Tensor
-    active: Tensor
+    kept: Tensor
 
     def __init__(self, model: Invertible, demonstrations: Demonstrations, settings: InversionSettings) -> None:
         super().__init__()
         model.check_settings(settings)
-        self._model = (model,)  # a tuple, so that it is not registered as a submodule
+        object.__setattr__(self, "model", model)  # not registered as a submodule
         self.demonstrations, self.settings = demonstrations, settings
         self.concepts = tuple(dict.fromkeys(demonstrations.concepts))
-        training, restarts = model.training_embeddings, settings.budget.restarts
-        # Rows span the training embeddings, whose mean is the origin of the concept space.
+        self.runs = self._runs()
+        # N training embeddings with mean 0 have rank N - 1 or less.
+        training = model.training_embeddings
         basis = torch.linalg.svd(training, full_matrices=False).Vh[: max(len(training) - 1, 1)]
         self.register_buffer("basis", basis, persistent=False)
-        self.runs = self._runs()
         self.register_buffer("is_mode", torch.tensor([run.mode > 0 for run in self.runs]), persistent=False)
-        self.register_buffer("active", torch.ones(len(self.runs), dtype=torch.bool), persistent=False)  # after screening
-        # A generator for each concept: its start does not depend on the rest of the batch. Its modes share the start.
-        draws = [generator("cpu", settings.seed, 0, task_key(name)) for name in self.concepts]
-        shape = (restarts, settings.components, training.shape[1])
-        starts = [torch.randn(shape, generator=draw) for draw in draws]
-        start = torch.cat([starts[run.concept] for run in self.runs[::restarts]])[:, :, None]
-        start = settings.embeddings.initial_spread * start.repeat(1, 1, settings.embeddings.knots, 1)
-        if settings.embeddings.start == CONCEPTS:
-            start = start + training.cpu()[torch.arange(len(start)) % restarts % len(training), None, None]
-        self.embeddings = nn.Parameter(start)
-        runs = (len(start), settings.components)
+        self.register_buffer("kept", torch.ones(len(self.runs), dtype=torch.bool), persistent=False)
+        # One generator per concept: its initial values do not depend on the other concepts.
+        draws = [generator("cpu", settings.seed, START, task_key(name)) for name in self.concepts]
+        self.embeddings = nn.Parameter(self._initial_embeddings(draws))
+        shape = (len(self.runs), settings.components)
         if settings.omega == "learned":
-            self.weights = nn.Parameter(torch.full(runs, float(settings.weights.initial)))
+            self.weights = nn.Parameter(torch.full(shape, float(settings.weights.initial)))
         else:
-            self.register_buffer("weights", torch.full(runs, float(settings.omega)), persistent=False)
-        # Adapter factors for each concept and restart: ``up (adapter, outputs, rank)``, initially 0, and ``down`` of each weight.
-        self.factors, rank = nn.ParameterList(), settings.adapter.rank
-        sizes = model.adaptable() if rank else {}
-        self._names = list(sizes)
-        adapted = [run for run in self.runs if not run.mode]
-        for outputs, inputs in sizes.values():
-            down = torch.stack([torch.randn(rank, inputs, generator=draws[run.concept]) for run in adapted])
-            self.factors.append(torch.zeros(len(adapted), outputs, rank))
-            self.factors.append(down / inputs**0.5)
+            self.register_buffer("weights", torch.full(shape, float(settings.omega)), persistent=False)
+        sizes = model.adaptable() if settings.adapter.rank else {}
+        self._adapted = list(sizes)
+        self.factors = self._initial_factors(list(sizes.values()), draws)
         tolerance = settings.budget.tolerance
         self.stopping = None if tolerance is None else Stopping(self.embeddings, self.weights, tolerance)
 
     def _runs(self) -> list[Run]:
-        """Runs by concept: first all its demonstrations, then its modes. Restarts of a run are adjacent."""
+        """Runs of each concept: on all its demonstrations, then on a part for each mode; each with its restarts."""
         texts, modes, runs = self.demonstrations.concepts, self.settings.modes.sets, []
         for concept, name in enumerate(self.concepts):
             rows = tuple(row for row, text in enumerate(texts) if text == name)
@@ -159,50 +166,71 @@ class Inversion(nn.Module):
             runs += [Run(concept, part, mode) for mode, part in enumerate(parts) for _ in range(self.settings.budget.restarts)]
         return runs
 
-    @property
-    def model(self) -> Invertible:
-        """The frozen model."""
-        return self._model[0]
+    def _initial_embeddings(self, draws: Sequence[torch.Generator]) -> Tensor:
+        """Initial embeddings ``(run, K, knots, n)``: normal noise around a training embedding, or around 0, the mean of them all.
+
+        The paper uses U([0, 1]^n). A concept and its modes have the same initial embeddings, and so have all knots of a component.
+        """
+        options, restarts, training = self.settings.embeddings, self.settings.budget.restarts, self.model.training_embeddings
+        shape = (restarts, self.settings.components, training.shape[1])
+        by_concept = [torch.randn(shape, generator=draw) for draw in draws]
+        noise = torch.cat([by_concept[run.concept] for run in self.runs[::restarts]])[:, :, None]
+        initial = options.initial_spread * noise.repeat(1, 1, options.knots, 1)
+        if options.start == CONCEPTS:
+            restart = torch.arange(len(initial)) % restarts
+            initial = initial + training.cpu()[restart % len(training), None, None]
+        return initial
+
+    def _initial_factors(self, sizes: Sequence[tuple[int, int]], draws: Sequence[torch.Generator]) -> nn.ParameterList:
+        """Initial ``up (adapter, outputs, rank)`` and ``down (adapter, rank, inputs)`` of each weight ``(outputs, inputs)``.
+
+        ``up`` is 0 and ``down`` is drawn from N(0, 1 / inputs), so that the initial update ``up @ down`` is 0.
+        """
+        factors, rank = nn.ParameterList(), self.settings.adapter.rank
+        learning = [run for run in self.runs if not run.mode]
+        for outputs, inputs in sizes:
+            down = torch.stack([torch.randn(rank, inputs, generator=draws[run.concept]) for run in learning])
+            factors.append(torch.zeros(len(learning), outputs, rank))
+            factors.append(down / inputs**0.5)
+        return factors
 
     @property
     def rates(self) -> list[tuple[nn.Parameter, float]]:
-        """Each parameter with its learning rate."""
+        """Each parameter with its initial learning rate."""
         learned = isinstance(self.weights, nn.Parameter)
         weights = [(self.weights, self.settings.weights.learning_rate)] if learned else []
         factors = [(factor, self.settings.adapter.learning_rate) for factor in self.factors]
         return [(self.embeddings, self.settings.budget.learning_rate), *weights, *factors]
 
-    def parametrised(self, embeddings: Tensor) -> Tensor:
-        """Scale the part of embeddings ``(run, K, knots, n)`` that is off the training span."""
+    def scale_off_span(self, embeddings: Tensor) -> Tensor:
+        """Scale the part of embeddings ``(..., n)`` that is orthogonal to the span of the training embeddings by ``off_span``."""
         if self.settings.embeddings.off_span == 1:
             return embeddings
         inside = embeddings @ self.basis.T @ self.basis
         return inside + self.settings.embeddings.off_span * (embeddings - inside)
 
-    def adapter(self, run: int) -> LowRank | None:
-        """Adapter of a run, shared by the modes of its concept; ``None`` without adapters."""
-        factors = [factor[self._adapter_of(run)] for factor in self.factors]
-        if not factors:
-            return None
-        named = dict(zip(self._names, zip(factors[::2], factors[1::2], strict=True), strict=True))
-        return LowRank(named, self.settings.adapter.scope == "all")
-
-    def _adapter_of(self, run: int) -> int:
-        """Number of a run's adapter, ordered by concept, then restart."""
+    def _adapter_index(self, run: int) -> int:
+        """Index of a run's adapter; adapters are ordered by concept, then restart."""
         restarts = self.settings.budget.restarts
         return self.runs[run].concept * restarts + run % restarts
 
+    def _adapter(self, index: int) -> LowRank:
+        """Adapter by its index."""
+        factors = [factor[index] for factor in self.factors]
+        pairs = zip(factors[::2], factors[1::2], strict=True)  # up and down
+        return LowRank(dict(zip(self._adapted, pairs, strict=True)), self.settings.adapter.scope == "all")
+
     def _composition(self, embeddings: Tensor, weights: Tensor, runs: Sequence[int]) -> Composition:
-        """Composition of runs with their adapters. Modes do not change the adapter of their concept."""
-        composition = Composition(self.parametrised(embeddings), weights)
+        """Composition ``(run, K, ...)`` of some runs, with their adapters; detached adapters if all these runs are modes."""
+        composition = Composition(self.scale_off_span(embeddings), weights)
         if not self.factors:
             return composition
-        first = {self._adapter_of(run): run for run in reversed(runs)}
-        different = list(dict.fromkeys(self._adapter_of(run) for run in runs))
-        adapters = [adapter for number in different if (adapter := self.adapter(first[number]))]
+        indices = [self._adapter_index(run) for run in runs]
+        used = list(dict.fromkeys(indices))
+        adapters = [self._adapter(index) for index in used]
         if all(self.runs[run].mode for run in runs):
             adapters = [adapter.detached() for adapter in adapters]
-        number = torch.tensor([1 + different.index(self._adapter_of(run)) for run in runs], device=weights.device)[:, None]
+        number = torch.tensor([1 + used.index(index) for index in indices], device=weights.device)[:, None]
         return replace(composition, adapters=tuple(adapters), adapter=number.expand_as(weights))
 
     def losses(
@@ -213,36 +241,45 @@ class Inversion(nn.Module):
         embeddings: Tensor | None = None,
         weights: Tensor | None = None,
     ) -> Tensor:
-        """Loss of Eq. 2 of every sample ``(run, samples)``. Runs share noise, timesteps and the relative start of windows.
+        """Loss of Eq. 2 for every sample of a run ``(run, samples)``. A sample is a window of a demonstration with noise.
+
+        Sample s of a run is from demonstration ``s mod D`` of the D demonstrations of the run. All runs have the same noise,
+        timesteps and relative starts of windows.
 
         Args:
-            samples: noised demonstrations of each run, spread evenly over its demonstrations.
-            draw: generator of noise, timesteps and windows.
-            chosen: bool mask of runs ``(run,)``; ``None`` for all.
-            embeddings, weights: of every run ``(run, K, knots, n)``, ``(run, K)``; ``None`` for the parameters.
+            samples: number of samples per run.
+            draw: random generator of timesteps, noise and windows.
+            chosen: bool mask of runs ``(run,)``; ``None`` for all runs.
+            embeddings, weights: values for all runs, ``(run, K, knots, n)`` and ``(run, K)``; ``None`` for the parameters.
         """
         embeddings, weights = self.embeddings if embeddings is None else embeddings, self.weights if weights is None else weights
         runs: Sequence[int] = range(len(self.runs))
         if chosen is not None:
             embeddings, weights, runs = embeddings[chosen], weights[chosen], chosen.nonzero()[:, 0].tolist()
         draws = self.model.draws(samples, self.settings.loss.timestep_power, draw)
-        demonstrated = [self.runs[run].rows for run in runs]
-        rows = torch.tensor([rows[sample % len(rows)] for rows in demonstrated for sample in range(samples)])
-        share = torch.rand(samples, generator=draw, device=embeddings.device).cpu().repeat(len(runs))
-        states, observed = self.model.windows(self.demonstrations, rows, share, draw)
+        by_run = [self.runs[run].rows for run in runs]
+        rows = torch.tensor([rows[sample % len(rows)] for rows in by_run for sample in range(samples)])
+        starts = torch.rand(samples, generator=draw, device=embeddings.device).cpu().repeat(len(runs))
+        states, observed = self.model.windows(self.demonstrations, rows, starts, draw)
         composition = self._composition(embeddings, weights, runs)
         return self.model.losses(states, observed, composition, draws, self.settings.loss.kind)
 
     def step_losses(self, step: int) -> Tensor:
-        """Mean losses of gradient step ``step`` ``(run,)``, over the active runs; ``UserError`` if the mean is not finite."""
+        """Mean losses ``(active run,)`` of gradient step ``step``, numbered from 0; modes come last.
+
+        A run is active unless it is screened out or has stopped early.
+
+        Raises:
+            UserError: if a loss is not finite.
+        """
         if self.stopping is not None and step == 0:
-            self.stopping.begin(self._held_out(self.embeddings, self.weights, None))
+            self.stopping.begin(self._held_out(self.embeddings, self.weights))
         losses = []
-        for samples, mask in ((self.settings.budget.samples, ~self.is_mode), (self.settings.modes.samples, self.is_mode)):
-            chosen = mask & self.active if self.stopping is None else mask & self.active & self.stopping.going
+        for samples, group in ((self.settings.budget.samples, ~self.is_mode), (self.settings.modes.samples, self.is_mode)):
+            chosen = group & self.kept if self.stopping is None else group & self.kept & self.stopping.going
             if chosen.any():
-                # A new generator for the modes, so that they do not depend on whether other runs are active.
-                draw = generator(self.embeddings.device, self.settings.seed, 1, step)
+                # A new generator for the modes: their noise does not depend on whether other runs are active.
+                draw = generator(self.embeddings.device, self.settings.seed, STEP, step)
                 with self._precision():
                     losses.append(self.losses(samples, draw, None if chosen.all() else chosen).mean(dim=1))
         every = torch.cat(losses)
@@ -256,84 +293,61 @@ class Inversion(nn.Module):
         reduced = self.settings.budget.precision == REDUCED
         return torch.autocast(self.embeddings.device.type, torch.bfloat16) if reduced else nullcontext()
 
-    def stepped(self, step: int) -> bool:
-        """Screen restarts and stop runs after gradient step ``step``, numbered from 0.
+    def after_step(self, step: int) -> bool:
+        """Screen restarts and stop runs early, if the settings ask for it, after gradient step ``step``, numbered from 0.
 
         Returns:
             Whether any run is still active.
         """
         if step + 1 == self.settings.budget.screening:
-            losses = self._held_out(self.embeddings, self.weights, None).unflatten(0, (-1, self.settings.budget.restarts))
-            self.active = functional.one_hot(losses.argmin(dim=1), losses.shape[1]).bool().flatten()
+            losses = self._held_out(self.embeddings, self.weights).unflatten(0, (-1, self.settings.budget.restarts))
+            self.kept = functional.one_hot(losses.argmin(dim=1), losses.shape[1]).bool().flatten()
             if self.stopping is not None:
-                self.stopping.going &= self.active  # otherwise no run would be left to step once the others stop
-        return self.stopping is None or self.stopping.stepped(step, self.embeddings, self.weights, self._held_out)
+                self.stopping.going &= self.kept  # a screened-out run counts as stopped
+        return self.stopping is None or self.stopping.after_step(step, self.embeddings, self.weights, self._held_out)
 
     @torch.no_grad()
-    def _held_out(self, embeddings: Tensor, weights: Tensor, chosen: Tensor | None) -> Tensor:
-        """Mean losses ``(run,)`` on held-out noise."""
-        draw = generator(self.embeddings.device, self.settings.seed, 3)
-        return self.losses(HELD_OUT, draw, chosen, embeddings, weights).mean(dim=1)
+    def _held_out(self, embeddings: Tensor, weights: Tensor, chosen: Tensor | None = None) -> Tensor:
+        """Held-out loss ``(run,)``: mean loss on the demonstrations with fixed noise that no gradient step uses."""
+        draw = generator(self.embeddings.device, self.settings.seed, HELD_OUT)
+        return self.losses(HELD_OUT_SAMPLES, draw, chosen, embeddings, weights).mean(dim=1)
 
+    @torch.no_grad()
     def _final(self, embeddings: Tensor, weights: Tensor) -> Tensor:
-        """Mean losses ``(run,)`` on fixed noise, common to all runs."""
-        draw = generator(self.embeddings.device, self.settings.seed, 2)
+        """Final loss ``(run,)``: mean loss on the demonstrations with another fixed noise, and more samples."""
+        draw = generator(self.embeddings.device, self.settings.seed, FINAL)
         return self.losses(FINAL_SAMPLES, draw, None, embeddings, weights).mean(dim=1)
 
     @torch.no_grad()
     def learned(self) -> dict[str, Concept]:
-        """Concepts by name, each from the restart with the lowest loss on common noise.
+        """Current concepts by name, of each run the restart with the lowest final loss.
+
+        With early stopping, embeddings and weights are those of the best round of steps, see
+        :class:`~ftl_lightning.igm.forms.stopping.Stopping`; before the first round ends, those of the last step.
 
         Raises:
             UserError: if a concept is not finite.
         """
-        # Before the first round of the stopping rule ends, there is no best round.
         source = self if self.stopping is None or not self.stopping.rounds else self.stopping
-        raw, weights, restarts = source.embeddings.detach(), source.weights.detach(), self.settings.budget.restarts
-        losses = self._final(raw, weights).where(self.active, torch.inf)
+        parameters, weights, restarts = source.embeddings.detach(), source.weights.detach(), self.settings.budget.restarts
+        losses = self._final(parameters, weights).where(self.kept, torch.inf)
         best = torch.arange(0, len(losses), restarts, device=losses.device) + losses.unflatten(0, (-1, restarts)).argmin(dim=1)
         auto = self.settings.modes.sets == "auto"
-        empty = self._final(raw, torch.zeros_like(weights)) if auto else losses
-        embeddings, kind = self.parametrised(raw), "learned" if self.settings.omega == "learned" else "fixed"
+        empty = self._final(parameters, torch.zeros_like(weights)) if auto else losses
+        embeddings, kind = self.scale_off_span(parameters), "learned" if self.settings.omega == "learned" else "fixed"
         if kind == "learned":
             weights = weights * self.settings.weights.scale
         concepts, pretrained = {}, self.model.hash
         for index, name in enumerate(self.concepts):
-            whole, *modes = [run for run in best.tolist() if self.runs[run].concept == index]
-            mixed = auto and bool(explained(empty[whole], losses[whole], losses[modes].mean()) >= EXPLAINED)
+            single, *modes = [run for run in best.tolist() if self.runs[run].concept == index]
+            # Mixtures of the modes are samples of the concept only if a single set of embeddings describes it nearly as well.
+            mixed = auto and bool(explained(empty[single], losses[single], losses[modes].mean()) >= EXPLAINED)
             concepts[name] = Concept(
-                embeddings[whole].cpu(),
-                weights[whole].cpu(),
-                self.model.origin(self.demonstrations, name, kind, losses[whole].item(), pretrained),
+                embeddings[single].cpu(),
+                weights[single].cpu(),
+                self.model.origin(self.demonstrations, name, kind, losses[single].item(), pretrained),
                 Modes(embeddings[modes].cpu(), weights[modes].cpu(), mixed) if modes else None,
-                adapter.copied() if (adapter := self.adapter(whole)) else None,
+                self._adapter(self._adapter_index(single)).copied() if self.factors else None,
             )
             concepts[name].check_finite(f"inversion: concept {name!r}")
         return concepts
-
-
-def explained(empty: Tensor, one: Tensor, modes: Tensor) -> Tensor:
-    """Gain of one set over the unconditional (empty concept's) loss, as a share of the modes' gain."""
-    return (empty - one) / (empty - modes)
-
-
-class Adam:
-    """Adam (Kingma & Ba, 2015) for one parameter, with cosine decay, in the arithmetic of torch's optimiser.
-
-    torch's optimiser classes import torch's compiler on first use, which may take longer than learning a concept.
-    """
-
-    def __init__(self, parameter: nn.Parameter, rate: float) -> None:
-        self.parameter, self.rate = parameter, rate
-        self._mean, self._square, self._count = torch.zeros_like(parameter), torch.zeros_like(parameter), torch.zeros(())
-
-    @torch.no_grad()
-    def step(self, gradient: Tensor, step: int, decay: int | None) -> None:
-        """Make gradient step ``step``, from 0; the rate decays to 0 over ``decay`` steps, ``None`` for a constant rate."""
-        self.parameter.grad = gradient
-        rates = {"lr": self.rate, "beta1": 0.9, "beta2": 0.999, "eps": 1e-8, "weight_decay": 0.0}
-        state: list[list[Tensor]] = [[self._mean], [self._square], [], [self._count]]
-        adam([self.parameter], [gradient], *state, amsgrad=False, maximize=False, **rates)  # type: ignore[arg-type]
-        if decay is not None:  # the recursion of torch's scheduler, in its order of arithmetic
-            after, before = (1 + math.cos(math.pi * done / decay) for done in (step + 1, step))
-            self.rate = after / before * self.rate

@@ -1,4 +1,4 @@
-"""The conditional diffusion model of the paper, and the interface through which concepts are learned."""
+"""The conditional diffusion model of the paper, and the interface of models through which concepts are learned."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple, Protocol
@@ -17,28 +17,28 @@ from ftl_lightning.igm.settings import InversionSettings
 
 
 class Draws(NamedTuple):
-    """Timesteps ``(sample,)`` int64 and noise ``(sample, horizon, state)`` of diffusion."""
+    """Diffusion timesteps ``t (sample,)`` int64 and standard normal noise ``(sample, horizon, state)``."""
 
     t: Tensor
     noise: Tensor
 
 
 class Invertible(Protocol):
-    """A frozen model through which concepts are learned, see :class:`~ftl_lightning.training.concept_model.ConceptModel`.
+    """Frozen model through which concepts are learned; see :class:`~ftl_lightning.training.concept_model.ConceptModel`.
 
     Attributes:
-        training_embeddings: ``(training concept, n)``; their mean is the origin of the concept space.
+        training_embeddings: embeddings of the training concepts ``(training concept, n)``, centred: their mean is 0.
     """
 
     training_embeddings: Tensor
 
     @property
     def device(self) -> torch.device:
-        """Device of the model."""
+        """Device of the parameters."""
 
     @property
     def hash(self) -> str:
-        """Hash of the weights."""
+        """Hash of the pretrained model."""
 
     @property
     def window(self) -> int:
@@ -54,24 +54,27 @@ class Invertible(Protocol):
 
     @property
     def text_space(self) -> bool:
-        """Whether the concept space is a text encoder's."""
+        """Whether concepts are embeddings of a text encoder."""
 
     def check_settings(self, settings: InversionSettings) -> None:
-        """Refuse settings that the model does not support."""
+        """Raise ``UserError`` for settings that the model does not support."""
 
     def adaptable(self) -> Mapping[str, tuple[int, int]]:
-        """Sizes ``(outputs, inputs)`` of the weights that an adapter can change, by name."""
+        """Sizes ``(outputs, inputs)`` of the weights that an adapter can modify, by parameter name."""
 
     def draws(self, samples: int, timestep_power: float, draw: torch.Generator) -> Draws | None:
-        """Random numbers of :meth:`losses`, shared by all runs; ``None`` for a deterministic loss."""
+        """Draw the timesteps and noise of :meth:`losses` for ``samples`` windows; ``None`` for a loss without noise."""
 
     def windows(
         self, demonstrations: Demonstrations, rows: Tensor, share: Tensor, draw: torch.Generator
     ) -> tuple[Tensor, Observed]:
-        """Training windows ``(row, window, state)`` and their observed features, on the model's device."""
+        """Windows ``(row, window, state)`` of demonstrations ``rows (row,)`` and their observed features, on the model's device.
+
+        ``share (row,)`` in [0, 1) is the relative start of each window, see ``Demonstrations.starts``.
+        """
 
     def losses(self, states: Tensor, observed: Observed, composition: Composition, draws: Draws | None, loss: str) -> Tensor:
-        """Loss of Eq. 2 ``(run, sample)``."""
+        """Loss of Eq. 2 ``(run, sample)`` of windows ``(run * sample, window, state)`` under compositions ``(run, K, ...)``."""
 
     def sample(
         self,
@@ -81,20 +84,20 @@ class Invertible(Protocol):
         generators: Sequence[torch.Generator],
         observed: Observed | None = None,
     ) -> Tensor:
-        """Behaviour ``(composition, count, horizon, state)``."""
+        """Sample ``count`` plans of each composition: ``(composition, count, horizon, state)``, in the domain's units."""
 
     def encode(self, states: Tensor, observed: Observed) -> Tensor:
-        """Normalised plans."""
+        """Normalise windows ``(batch, window, state)`` to plans ``(batch, horizon, state)``."""
 
     def origin(self, demonstrations: Demonstrations, name: str, weights: str, loss: float, pretrained: str = "") -> Origin:
-        """Provenance of a concept learned through the model."""
+        """Provenance of the learned concept ``name``; ``weights`` is ``'fixed'`` or ``'learned'``."""
 
 
 class DiffusionModel(nn.Module):
-    """Losses (Eq. 2) and samples of a conditional diffusion model, of normalised plans.
+    """Composed losses (Eq. 2) and samples of a conditional diffusion model of normalised plans.
 
     Attributes:
-        denoiser: noise estimate with a single concept per sample, an ``nn.Module`` with ``observe``.
+        denoiser: network ``eps_theta``, a :data:`~ftl_lightning.igm.diffusion.Denoiser` with a method ``observe``.
         alpha_bar: schedule ``(T,)``.
         empty: unconditional embedding ``(n,)``.
         plan: shape ``(horizon, state)`` of a plan.
@@ -107,25 +110,29 @@ class DiffusionModel(nn.Module):
 
     @property
     def max_steps(self) -> int:
-        """T, the maximum number of sampler steps."""
+        """Number T of diffusion steps."""
         return len(self.alpha_bar)
 
     def draws(self, samples: int, timestep_power: float, draw: torch.Generator) -> Draws:
-        """Draw noise and stratified timesteps ``T (1 - u^power)``, u uniform in [0, 1)."""
+        """Draw noise and timesteps, see :func:`~ftl_lightning.igm.diffusion.timesteps`.
+
+        The timesteps are stratified: one u in each of ``samples`` equal parts of [0, 1), in random order. This lowers the variance
+        of the mean loss.
+        """
         device = draw.device
-        spread = (torch.arange(samples, device=device) + torch.rand(samples, generator=draw, device=device)) / samples
-        t = timesteps(spread, len(self.alpha_bar), timestep_power)[torch.randperm(samples, generator=draw, device=device)]
+        u = (torch.arange(samples, device=device) + torch.rand(samples, generator=draw, device=device)) / samples
+        t = timesteps(u, len(self.alpha_bar), timestep_power)[torch.randperm(samples, generator=draw, device=device)]
         return Draws(t, torch.randn((samples, *self.plan), generator=draw, device=device))
 
     def composed_losses(self, clean: Tensor, context: Context, composition: Composition, draws: Draws, loss: str) -> Tensor:
         """Loss of Eq. 2 ``(run, sample)``.
 
         Args:
-            clean: plans ``(run * sample, horizon, state)``.
+            clean: normalised plans ``(run * sample, horizon, state)``.
             context: encoded observed features of each plan.
-            composition: ``(run, K, ...)``.
-            draws: timesteps and noise of the samples, shared by all runs.
-            loss: target of the squared error, see :func:`~ftl_lightning.igm.diffusion.loss_weights`.
+            composition: batch of compositions, one per run: weights ``(run, K)``.
+            draws: timesteps and noise of the samples, the same for all runs.
+            loss: quantity whose squared error is the loss, see :func:`~ftl_lightning.igm.diffusion.loss_weights`.
         """
         runs = len(composition.embeddings)
         losses = denoising_loss(
@@ -145,18 +152,19 @@ class DiffusionModel(nn.Module):
         generators: Sequence[torch.Generator],
         context: Context,
     ) -> Tensor:
-        """Sample plans ``(composition * count, horizon, state)`` with the composed denoiser.
+        """Sample normalised plans ``(composition * count, horizon, state)`` with the composed denoiser (section 4.3).
 
         Args:
-            compositions: ``(K, ...)`` each; K may differ.
-            count: samples for each composition.
-            generators: a noise generator for each composition.
+            compositions: compositions with weights ``(K,)``; K may differ between them.
+            count: number of plans for each composition.
+            sampling: sampler, number of steps and temperature.
+            generators: random generator of each composition.
             context: encoded observed features of each plan.
         """
-        together, row = batched(compositions, count, generators)
+        batch, row = batched(compositions, count, generators)
 
         def epsilon(x: Tensor, t: Tensor) -> Tensor:
-            return composed_epsilon(self.denoiser, x, t, together, self.empty, context, row)
+            return composed_epsilon(self.denoiser, x, t, batch, self.empty, context, row)
 
         def noise() -> Tensor:
             # Draw on the generators' device: a seed gives the same samples on every device.

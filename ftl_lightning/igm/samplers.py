@@ -1,9 +1,9 @@
-"""Samplers: functions of a noise estimate with a common signature.
+"""Samplers: the reverse process from noise ``x_T`` to a plan ``x_0``, for any noise estimate (section 4.3 of the paper).
 
-``epsilon(x, t)`` maps ``x (batch, horizon, state)`` and ``t (batch,)`` int64 to the estimated noise; usually it is
-:func:`ftl_lightning.igm.guidance.composed_epsilon`. ``alpha_bar (T,)`` is the schedule of pretraining. ``steps <= T`` are
-evenly spaced on it. ``temperature`` is the paper's alpha, a factor of the variance of the initial noise and of all noise added
-later. ``noise()`` draws standard normal noise ``(batch, horizon, state)`` and is the only source of randomness.
+Each sampler has the arguments ``epsilon``, noise estimate ``(x (batch, horizon, state), t (batch,) int64) -> noise``, usually
+:func:`~ftl_lightning.igm.guidance.composed_epsilon`; ``noise``, which draws standard normal noise ``(batch, horizon, state)`` and
+is the only source of randomness; ``alpha_bar (T,)``, the schedule of pretraining; ``steps``, the number of timesteps visited,
+from 1 to T; ``temperature``, the paper's alpha, a factor of the variance of the initial noise and of all later noise.
 """
 
 import itertools
@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.igm.diffusion import clean_from_epsilon
-from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.errors import require
 from ftl_lightning.services.validation import check_count, check_factor
 
 Epsilon = Callable[[Tensor, Tensor], Tensor]
@@ -24,13 +24,13 @@ Noise = Callable[[], Tensor]
 
 
 class Sampler(Protocol):
-    """Common signature; returns ``(batch, horizon, state)`` in normalised units."""
+    """Signature of a sampler; returns normalised plans ``x_0 (batch, horizon, state)``."""
 
     def __call__(self, epsilon: Epsilon, noise: Noise, alpha_bar: Tensor, steps: int, temperature: float) -> Tensor: ...
 
 
-def timesteps(total: int, steps: int) -> list[int]:
-    """``steps`` evenly spaced timesteps from ``total - 1`` down to 0.
+def sampler_timesteps(total: int, steps: int) -> list[int]:
+    """Timesteps visited by a sampler: ``steps`` evenly spaced ones from ``total - 1`` down to 0; a single one is ``total - 1``.
 
     Raises:
         ValueError: unless ``1 <= steps <= total``.
@@ -41,53 +41,52 @@ def timesteps(total: int, steps: int) -> list[int]:
 
 
 def _clean(epsilon: Epsilon, x: Tensor, t: int, alpha_bar: Tensor) -> Tensor:
+    """Estimate of the clean plans ``x_0`` at timestep ``t``, clipped to [-1, 1]."""
     return clean_from_epsilon(x, epsilon(x, torch.full((len(x),), t, device=x.device)), alpha_bar[t])
 
 
 @torch.no_grad()
 def ddpm(epsilon: Epsilon, noise: Noise, alpha_bar: Tensor, steps: int, temperature: float) -> Tensor:
-    """Ancestral sampling (Ho et al., 2020) on a subset of the timesteps; the paper's sampler for ``steps = T``."""
+    """Ancestral sampling (Ho et al., 2020, Eq. 7) on a subset of the timesteps; the paper's sampler for ``steps = T``."""
     x = temperature**0.5 * noise()
-    visited = timesteps(len(alpha_bar), steps)
-    for t, before in zip(visited, [*visited[1:], None], strict=True):
+    visited = sampler_timesteps(len(alpha_bar), steps)
+    for t, following in itertools.pairwise(visited):
         clean = _clean(epsilon, x, t, alpha_bar)
-        if before is None:
-            return clean
-        ratio = alpha_bar[t] / alpha_bar[before]
-        spread = 1 - alpha_bar[t]
-        mean = (alpha_bar[before].sqrt() * (1 - ratio) * clean + ratio.sqrt() * (1 - alpha_bar[before]) * x) / spread
-        variance = (1 - ratio) * (1 - alpha_bar[before]) / spread
+        alpha = alpha_bar[t] / alpha_bar[following]  # 1 - beta of the step
+        beta_bar = 1 - alpha_bar[t]
+        mean = (alpha_bar[following].sqrt() * (1 - alpha) * clean + alpha.sqrt() * (1 - alpha_bar[following]) * x) / beta_bar
+        variance = (1 - alpha) * (1 - alpha_bar[following]) / beta_bar
         x = mean + (temperature * variance).sqrt() * noise()
-    raise AssertionError("timesteps is never empty")
+    return _clean(epsilon, x, visited[-1], alpha_bar)
 
 
 @torch.no_grad()
 def ddim(epsilon: Epsilon, noise: Noise, alpha_bar: Tensor, steps: int, temperature: float) -> Tensor:
-    """DDIM (Song et al., 2021, eta = 0): deterministic given the initial noise."""
+    """DDIM (Song et al., 2021, Eq. 12 with eta = 0): deterministic given the initial noise."""
     x = temperature**0.5 * noise()
-    visited = timesteps(len(alpha_bar), steps)
-    for t, before in itertools.pairwise(visited):
+    visited = sampler_timesteps(len(alpha_bar), steps)
+    for t, following in itertools.pairwise(visited):
         clean = _clean(epsilon, x, t, alpha_bar)
-        implied = (x - alpha_bar[t].sqrt() * clean) / (1 - alpha_bar[t]).sqrt()
-        x = alpha_bar[before].sqrt() * clean + (1 - alpha_bar[before]).sqrt() * implied
+        predicted_noise = (x - alpha_bar[t].sqrt() * clean) / (1 - alpha_bar[t]).sqrt()  # of the clipped clean plan
+        x = alpha_bar[following].sqrt() * clean + (1 - alpha_bar[following]).sqrt() * predicted_noise
     return _clean(epsilon, x, visited[-1], alpha_bar)
 
 
 @torch.no_grad()
 def dpm_solver(epsilon: Epsilon, noise: Noise, alpha_bar: Tensor, steps: int, temperature: float) -> Tensor:
-    """DPM-Solver++ (2M) (Lu et al., 2022): second order, data prediction, deterministic given the initial noise."""
+    """DPM-Solver++(2M) (Lu et al., 2022): second-order multistep solver, deterministic given the initial noise."""
     x = temperature**0.5 * noise()
-    visited = timesteps(len(alpha_bar), steps)
+    visited = sampler_timesteps(len(alpha_bar), steps)
     scale, sigma = alpha_bar.sqrt(), (1 - alpha_bar).sqrt()
     half_log_snr = scale.log() - sigma.log()
-    previous: tuple[Tensor, Tensor] | None = None  # clean estimate and length in half log-SNR of the last step
-    for t, before in itertools.pairwise(visited):
+    previous: tuple[Tensor, Tensor] | None = None  # clean plans and length in half log-SNR of the last step
+    for t, following in itertools.pairwise(visited):
         clean = _clean(epsilon, x, t, alpha_bar)
-        step = half_log_snr[before] - half_log_snr[t]
+        step = half_log_snr[following] - half_log_snr[t]
         estimate = clean
         if previous is not None:
             estimate = clean + step / (2 * previous[1]) * (clean - previous[0])
-        x = sigma[before] / sigma[t] * x - scale[before] * torch.expm1(-step) * estimate
+        x = sigma[following] / sigma[t] * x - scale[following] * torch.expm1(-step) * estimate
         previous = clean, step
     return _clean(epsilon, x, visited[-1], alpha_bar)
 
@@ -102,7 +101,7 @@ class Sampling:
     Attributes:
         sampler: key of :data:`SAMPLERS`.
         steps: number of sampler steps, from 1 to the model's T.
-        temperature: the paper's alpha, 0 or more; lower is more accurate and less diverse.
+        temperature: the paper's alpha, 0 or more; lower gives more accurate and less diverse plans.
 
     Raises:
         UserError: at construction, for an invalid value.
@@ -113,15 +112,12 @@ class Sampling:
     temperature: float = 0.1
 
     def __post_init__(self) -> None:
-        if self.sampler not in SAMPLERS:
-            raise UserError(f"sampler: expected one of {', '.join(SAMPLERS)}, found {self.sampler!r}")
-        if self.steps < 1:
-            raise UserError(f"steps: expected 1 or more, found {self.steps}")
-        if not 0 <= self.temperature < math.inf:
-            raise UserError(f"temperature: expected 0 or more, found {self.temperature}")
+        require(self.sampler in SAMPLERS, "sampler", f"one of {', '.join(SAMPLERS)}", repr(self.sampler))
+        require(self.steps >= 1, "steps", "1 or more", self.steps)
+        require(0 <= self.temperature < math.inf, "temperature", "0 or more", self.temperature)
         check_factor("temperature", self.temperature, 0)
         check_count("steps", self.steps, 1)
 
     def run(self, epsilon: Epsilon, noise: Noise, alpha_bar: Tensor) -> Tensor:
-        """Sample clean normalised plans ``(batch, horizon, state)``; arguments as in :class:`Sampler`."""
+        """Sample normalised plans ``(batch, horizon, state)``; the arguments are those of a :class:`Sampler`."""
         return SAMPLERS[self.sampler](epsilon, noise, alpha_bar, self.steps, self.temperature)

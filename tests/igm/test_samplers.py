@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.igm.diffusion import add_noise, clean_from_epsilon, cosine_alpha_bar, denoising_loss
-from ftl_lightning.igm.samplers import SAMPLERS, Sampling, ddim, ddpm, dpm_solver, timesteps
+from ftl_lightning.igm.samplers import SAMPLERS, Sampling, ddim, ddpm, dpm_solver, sampler_timesteps
 from ftl_lightning.services.errors import UserError
 
 ALPHA_BAR = cosine_alpha_bar(100)
@@ -53,10 +53,10 @@ def test_the_schedule_is_the_cosine_one_and_timesteps_cover_it() -> None:
 
     theirs = DDPMScheduler(num_train_timesteps=100, beta_schedule="squaredcos_cap_v2").alphas_cumprod
     assert torch.allclose(ALPHA_BAR, theirs, atol=1e-5)
-    assert timesteps(100, 100) == list(range(99, -1, -1))
-    assert timesteps(100, 12) == [99, 90, 81, 72, 63, 54, 45, 36, 27, 18, 9, 0]
+    assert sampler_timesteps(100, 100) == list(range(99, -1, -1))
+    assert sampler_timesteps(100, 12) == [99, 90, 81, 72, 63, 54, 45, 36, 27, 18, 9, 0]
     with pytest.raises(ValueError, match="expected 1 to 100"):
-        timesteps(100, 101)
+        sampler_timesteps(100, 101)
 
 
 def test_ddpm_equals_diffusers() -> None:
@@ -76,7 +76,7 @@ def test_ddim_equals_diffusers(steps: int) -> None:
     x = torch.randn(SHAPE, generator=generator())
     scheduler = DDIMScheduler(num_train_timesteps=100, trained_betas=betas(), clip_sample_range=1.0)
     scheduler.num_inference_steps = 100
-    visited = timesteps(100, steps)
+    visited = sampler_timesteps(100, steps)
     for t, before in itertools.pairwise(visited):
         scheduler.alphas_cumprod = ALPHA_BAR[[before, t]]
         x = scheduler.step(exact(x, torch.full((len(x),), t)), 1, x).prev_sample
@@ -92,7 +92,7 @@ def test_dpm_solver_equals_diffusers(steps: int) -> None:
         num_train_timesteps=100, trained_betas=betas(), solver_order=2, lower_order_final=False, final_sigmas_type="zero"
     )
     scheduler.set_timesteps(steps)
-    visited = torch.tensor(timesteps(100, steps))
+    visited = torch.tensor(sampler_timesteps(100, steps))
     scheduler.timesteps = visited
     scheduler.sigmas = torch.cat((((1 - ALPHA_BAR) / ALPHA_BAR).sqrt()[visited], torch.zeros(1)))
     x = torch.randn(SHAPE, generator=generator())

@@ -14,7 +14,8 @@ from ftl_lightning.evaluation.references import FRESH, REPLAYED
 from ftl_lightning.evaluation.results import configuration, read_rows
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.igm.forms.leave_one_out import quickly
-from ftl_lightning.igm.inversion import Inversion, explained, invert
+from ftl_lightning.igm.forms.modes import explained
+from ftl_lightning.igm.inversion import Inversion, invert
 from ftl_lightning.igm.settings import EXPLAINED, InversionSettings
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.services.errors import UserError
@@ -131,7 +132,7 @@ def test_restarts_start_at_training_concepts_and_the_best_of_them_goes_on_alone(
     monkeypatch.setattr(inversion, "step_losses", counted)
     learned = invert(model, demonstrations, settings, steps, start=inversion)
     assert runs == [3 * len(inversion.concepts)] * 2 + [len(inversion.concepts)] * 3
-    kept = inversion.embeddings[inversion.active]
+    kept = inversion.embeddings[inversion.kept]
     assert torch.equal(torch.stack([concept.embeddings for concept in learned.values()]), kept)
 
 
@@ -141,7 +142,7 @@ def test_after_screening_an_inversion_ends_when_those_that_go_on_have_stopped(ti
     inversion = Inversion(load_model(tiny), demonstrations, settings)
     for step in range(60):
         assert inversion.step_losses(step).isfinite().all()
-        if not inversion.stepped(step):
+        if not inversion.after_step(step):
             break
     assert step < 59  # nothing moves without an optimizer, so rounds of ten steps gain nothing
     assert not inversion.stopping.going.any()
@@ -173,7 +174,7 @@ def test_the_best_of_several_restarts_is_kept(tiny: Path) -> None:
 def test_the_span_form_stays_in_the_span(tiny: Path, off_span: float, inside: bool) -> None:
     module = learn(tiny, off_span=off_span)
     training = module.model.training_embeddings
-    found = module.inversion.parametrised(module.inversion.embeddings).detach().flatten(0, 2)
+    found = module.inversion.scale_off_span(module.inversion.embeddings).detach().flatten(0, 2)
     solution = torch.linalg.lstsq(training.T.double(), found.T.double()).solution
     outside = (training.T.double() @ solution - found.T).norm() / found.norm()
     assert (outside < 1e-3) == inside

@@ -46,7 +46,7 @@ def follow(losses: Sequence[Sequence[float]], tolerance: float) -> tuple[Stoppin
             return known[chosen, (step + 1) // ROUND]
 
         before = rule.going.clone()
-        goes_on = rule.stepped(step, here, here[..., 0], held_out)
+        goes_on = rule.after_step(step, here, here[..., 0], held_out)
         assert goes_on == bool(rule.going.any())
         assert not (rule.going & ~before).any()  # what has stopped does not begin again
         for run in (before & ~rule.going).nonzero().flatten().tolist():
@@ -115,7 +115,7 @@ def test_within_a_round_nothing_is_judged() -> None:
     rule = Stopping(torch.zeros(1, 1, 1), torch.zeros(1, 1), 0.1)
     rule.begin(torch.ones(1))
     for step in range(ROUND - 1):
-        assert rule.stepped(step, torch.ones(1, 1, 1), torch.ones(1, 1), lambda *_: pytest.fail("judged"))
+        assert rule.after_step(step, torch.ones(1, 1, 1), torch.ones(1, 1), lambda *_: pytest.fail("judged"))
     assert rule.embeddings.item() == 0
 
 

@@ -21,6 +21,17 @@ def even_stretch(modes: int) -> float:
     return ((modes + 1) * modes / (modes - 1)) ** 0.5 if modes > 1 else 1.0
 
 
+def explained(empty: Tensor, single: Tensor, modes: Tensor) -> Tensor:
+    """Loss reduction by a single set of embeddings, as a share of the loss reduction by modes.
+
+    Args:
+        empty: loss of the empty concept, from which both reductions are measured ``(...)``.
+        single: loss of a single set of embeddings for all demonstrations, in the same shape.
+        modes: mean loss of the modes, in the same shape.
+    """
+    return (empty - single) / (empty - modes)
+
+
 @dataclass(frozen=True, repr=False)
 class Modes(Shown):
     """Several sets of embeddings of a concept with multimodal behaviour.

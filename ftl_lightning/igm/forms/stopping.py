@@ -1,4 +1,4 @@
-"""Early stopping of an inversion: each run stops once its loss on held-out noise no longer falls."""
+"""Early stopping of an inversion: a run stops when its held-out loss no longer falls."""
 
 from collections.abc import Callable
 
@@ -8,24 +8,28 @@ from torch import Tensor, nn
 ROUND = 10
 """Steps between two evaluations of the held-out loss."""
 IDLE = 2
-"""Patience: rounds with too small a gain before a run stops."""
+"""Patience: consecutive idle rounds after which a run stops."""
 
 
 class Stopping(nn.Module):
-    """Mean embeddings and weights of every run over its round of :data:`ROUND` steps with the lowest held-out loss.
+    """Rule of early stopping, and the result of every run.
 
-    The mean over a round replaces a decaying learning rate, which would need the number of steps. The state is in buffers, so
-    that checkpoints resume exactly.
+    A round is :data:`ROUND` gradient steps. After each round, embeddings and weights are averaged over the steps of the round, and
+    the held-out loss of the average is evaluated. The result of a run is the average with the lowest held-out loss, or the initial
+    value if no average has a lower loss. Averages replace the decay of the learning rate, which requires the number of steps.
+
+    A round is idle if it lowers the lowest held-out loss of the run by at most ``tolerance`` times the total decrease since the
+    start. A run stops after :data:`IDLE` consecutive idle rounds. The state is in buffers: checkpoints resume exactly.
 
     Args:
         embeddings: initial embeddings ``(run, K, knots, n)``.
         weights: initial weights ``(run, K)``.
-        tolerance: a run stops when :data:`IDLE` consecutive rounds gain less than this share of its total gain.
+        tolerance: maximum relative decrease of an idle round, in [0, 1).
 
     Attributes:
         going: mask of active runs ``(run,)``.
-        embeddings, weights: best of every run so far.
-        least: their held-out losses ``(run,)``.
+        embeddings, weights: result of every run so far.
+        least: held-out losses of the results ``(run,)``.
         rounds: number of completed rounds.
     """
 
@@ -58,13 +62,15 @@ class Stopping(nn.Module):
         self._first[:] = losses
 
     @torch.no_grad()
-    def stepped(self, step: int, embeddings: Tensor, weights: Tensor, held_out: Callable[[Tensor, Tensor, Tensor], Tensor]) -> bool:
-        """Record a step, and at the end of a round stop runs without gain.
+    def after_step(
+        self, step: int, embeddings: Tensor, weights: Tensor, held_out: Callable[[Tensor, Tensor, Tensor], Tensor]
+    ) -> bool:
+        """Add the parameters to the averages of the round; at the end of a round, evaluate the averages and stop runs.
 
         Args:
             step: number of the step from 0.
             embeddings, weights: parameters of every run after the step.
-            held_out: ``(embeddings, weights, runs) -> losses`` of the runs in the mask ``runs (run,)``.
+            held_out: held-out loss ``(embeddings, weights, mask) -> losses`` of the runs in the mask ``(run,)``.
 
         Returns:
             Whether any run is active.
