@@ -110,7 +110,7 @@ POLICIES = {
 
 _ON_ROBOT = ("new concept", 0.55, ""), ("training representation", 0.15, ""), ("training concept", 0.90, PUSH)
 PUBLISHED = tuple(Published(setting, value, task=task, metric=EXECUTED) for setting, value, task in _ON_ROBOT)
-"""Results of the paper on a real robot, 20 episodes each (section 4.5)."""
+"""Results of the paper on a real robot, 20 episodes each (section 5.1)."""
 
 _LOOP = ClosedLoop(
     environment=environment,
