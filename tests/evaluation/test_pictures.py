@@ -37,6 +37,7 @@ def test_packed_points_are_within_a_step_and_absent_ones_stay_absent() -> None:
     assert film.frames == 4
 
 
+@pytest.mark.slow
 def test_an_evaluation_writes_films_of_its_rows(evaluated: Path, log: Path) -> None:
     content, rows = json.loads((evaluated / "films.json").read_text()), read_rows(log)
     assert content["domain"] == "object_rearrangement"

@@ -12,7 +12,11 @@ from ftl_lightning.training.data import InversionData
 from ftl_lightning.training.model_folder import load_model
 
 
-@pytest.mark.parametrize("options", [{}, {"modes": "each"}, {"adapter": 2}], ids=["one set", "modes", "adapter"])
+@pytest.mark.parametrize(
+    "options",
+    [{}, pytest.param({"modes": "each"}, marks=pytest.mark.slow), pytest.param({"adapter": 2}, marks=pytest.mark.slow)],
+    ids=["one set", "modes", "adapter"],
+)
 def test_products_in_bfloat16_learn_the_same_concept_but_for_their_rounding(tiny: Path, options: dict[str, object]) -> None:
     model, data = load_model(str(tiny)), InversionData("object_rearrangement", suite="validation").demonstrations
     settings, steps = InversionSettings().changed(samples=16, **options), 60

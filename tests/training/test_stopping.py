@@ -228,17 +228,22 @@ def expect_same(found: dict[str, Concept], expected: dict[str, Concept]) -> None
             assert other.modes.mixed == one.modes.mixed
 
 
+MORE_OPTIONS: list[dict[str, Any]] = [
+    {"off_span": 0.1, "restarts": 2, "loss": "v", "timestep_power": 3.0},
+    {"start": "concepts", "restarts": 3, "screening": 2},
+    {"tolerance": 0.3},
+    {"tolerance": 0.3, "omega": "learned"},
+    {"modes": 2},
+]
+
+
 @pytest.mark.parametrize(
     "options",
     [
         {},
         {"omega": "learned", "components": 3},
-        {"off_span": 0.1, "restarts": 2, "loss": "v", "timestep_power": 3.0},
-        {"start": "concepts", "restarts": 3, "screening": 2},
-        {"tolerance": 0.3},
-        {"tolerance": 0.3, "omega": "learned"},
         {"tolerance": 0.3, "modes": "auto"},
-        {"modes": 2},
+        *(pytest.param(options, marks=pytest.mark.slow) for options in MORE_OPTIONS),
     ],
     ids=str,
 )
