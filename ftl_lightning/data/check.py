@@ -21,7 +21,10 @@ MOST_NAMED = 6  # demonstrations to list individually
 POINTS = 32  # number of even times at which demonstrations are compared
 UNUSUAL = 3.0  # ratio to all other lengths that makes a length unusual
 DISCRETE = 5  # maximum number of distinct values of a discrete column, which may jump
-JUMP, JUMP_ALONE = 3.0, 10.0  # ratio of a jump to the largest other step, in several columns and in one; fourfold for few steps
+JUMP, JUMP_ALONE = (
+    3.0,
+    10.0,
+)  # Ratio of a jump to the largest other step, in several columns and in a single; times 4 for few steps
 WRAPPED = 0.8  # share of a column's range that a step covers where an angle wraps
 STILL = 1e-3  # maximum step that counts as standing still, as a share of the usual step
 FEW = 3  # minimum steps of a still stretch, and of the longest demonstration, for a fault
@@ -111,9 +114,9 @@ def read_mended(path: str) -> tuple[Demonstrations, tuple[Finding, ...]]:
 
 
 def check(demonstrations: Demonstrations) -> tuple[Finding, ...]:
-    """Check demonstrations as those of a single concept, whatever their texts; errors and warnings come first.
+    """Check demonstrations as examples of a single concept, ignoring their texts; notes are last.
 
-    Later comparisons exclude demonstrations with a fault.
+    A demonstration with a finding is excluded from later checks.
     """
     few = Finding("three to five demonstrations are usual; fewer do not show which of them is odd", "note")
     findings = [*([few] if len(demonstrations) < 3 else []), *_constant(demonstrations)]
@@ -283,7 +286,7 @@ def _wraps(states: Tensor, steps: list[Tensor]) -> bool:
 
 
 def _units(demonstrations: Demonstrations) -> Iterator[Finding]:
-    """Find demonstrations whose values are many times the others', or a small part of them."""
+    """Find demonstrations whose values are much larger or smaller than the others'."""
     paths = _paths(demonstrations)
     sizes = torch.stack([path.abs().amax(dim=0) for path in paths])
     varies = torch.cat(paths).std(dim=0, correction=0) > SAME * sizes.amax(dim=0)
@@ -321,9 +324,9 @@ def _outliers(demonstrations: Demonstrations) -> Iterator[Finding]:
 
 
 def _far(points: Tensor, row: int) -> tuple[float, float]:
-    """Distance of a demonstration from the others: its median over theirs, and its minimum over their maximum.
+    """Distance of a demonstration from the others relative to distances among them: ratio of medians, and minimum over maximum.
 
-    Columns are scaled by the others' spread, lest an outlier hides itself.
+    Columns are scaled by the spread of the others, so that an outlier does not inflate it.
     """
     others = _others(range(len(points)), row)
     all_spread, spread = (part.flatten(0, 1).std(dim=0, correction=0) for part in (points, points[others]))

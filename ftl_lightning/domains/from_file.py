@@ -104,7 +104,7 @@ def domain_from_file(path: str, horizon: int | None, metrics: Mapping[str, float
         path: the file, the folder of a LeRobot data set, or the name of an installed Minari data set.
         horizon: states in a plan; ``None`` for the length of the longest demonstration.
         metrics: see :func:`own_domain`.
-        share: share of each concept's demonstrations to hold out, at least one.
+        share: share of each concept's demonstrations to hold out, at least a single demonstration.
 
     Raises:
         UserError: naming the file, if it has no texts, fewer than two concepts, or a concept with a single demonstration.
@@ -139,10 +139,10 @@ def read_demonstrations(path: str, domain: Domain) -> Demonstrations:
         UserError: naming the file, if it does not fit the domain.
     """
     demonstrations = read_own(path)
-    columns, found = len(domain.plans.columns), tuple(demonstrations.states.shape)
+    columns, shape = len(domain.plans.columns), tuple(demonstrations.states.shape)
     known = demonstrations.domain in ("", domain.name)
     require(known, f"{path}: key 'domain'", repr(domain.name), repr(short(demonstrations.domain)))
-    require(found[2] == columns, f"{path}: key 'states'", f"shape (demo, time, {columns})", str(found))
+    require(shape[2] == columns, f"{path}: key 'states'", f"shape (demo, time, {columns})", str(shape))
     with about(path):
         return demonstrations.fitted(domain.observed)
 

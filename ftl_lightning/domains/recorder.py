@@ -97,8 +97,8 @@ def check_path(scene: Scene, path: Any, seconds: Any) -> tuple[Numbers, Numbers]
     require((np.diff(times) >= 0).all(), "seconds", "times that never go back", "some that do")
     left, lower, width, height = scene.film.window
     away = np.abs((places - (left + width / 2, lower + height / 2)) / (width, height)).max()
-    found = f"one {away:.3g} times its size from its middle"
-    require(away <= 0.5 + AROUND, "path", "places near what is in sight", found)
+    far = f"one {away:.3g} times its size from its middle"
+    require(away <= 0.5 + AROUND, "path", "places near what is in sight", far)
     return places, times
 
 

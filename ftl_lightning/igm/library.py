@@ -88,7 +88,7 @@ class Entry:
         model: hash of the model.
         count: number of demonstrations; ``None`` for a training concept.
         form: form, such as ``'one set'`` or ``'adapter'``; empty for a training concept.
-        accuracy: share of right samples, 0 to 1, if recorded.
+        accuracy: share of correct samples, 0 to 1, if recorded.
         metric: the accuracy's domain metric; empty without an accuracy.
         path: file; ``None`` for a training concept.
     """

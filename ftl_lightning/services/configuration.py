@@ -112,9 +112,9 @@ def _beside(path: Path, name: str) -> Path:
     try:
         for folder in path.absolute().parents:
             if (folder / name).is_file():
-                found = folder / name
-                relative = not path.is_absolute() and found.is_relative_to(Path.cwd())  # as the user's path is
-                return found.relative_to(Path.cwd()) if relative else found
+                file = folder / name
+                relative = not path.is_absolute() and file.is_relative_to(Path.cwd())  # as the user's path is
+                return file.relative_to(Path.cwd()) if relative else file
         if (ours := shipped(name)).is_file():
             return ours
     except (OSError, ValueError) as error:  # a name that no file can have, or a folder that cannot be read

@@ -134,7 +134,7 @@ def serialise(kind: str, tensors: Mapping[str, Tensor], header: Mapping[str, Any
 def save_tensors(
     path: str | Path, kind: str, tensors: Mapping[str, Tensor], header: Mapping[str, Any], version: int = FORMAT
 ) -> None:
-    """Write the bytes of :func:`serialise`, with the same arguments, whole or not at all."""
+    """Write the bytes of :func:`serialise`, with the same arguments, atomically."""
     with atomic(path) as temporary:
         temporary.write_bytes(serialise(kind, tensors, header, version))
 

@@ -169,7 +169,7 @@ class ConceptModel(Shown, nn.Module, ABC):
         return Origin(name, *space, selected.hash, len(selected), weights, loss)
 
     def draws(self, samples: int, timestep_power: float, draw: torch.Generator) -> Draws | None:
-        """Random numbers of :meth:`losses`, shared by all runs; ``None`` for a deterministic loss."""
+        """Random numbers of :meth:`losses`, common to all runs; ``None`` for a deterministic loss."""
         return None
 
     def windows(
@@ -285,21 +285,21 @@ class ConceptModel(Shown, nn.Module, ABC):
         """
         if not self.config.observed:
             return None
-        seen = self._seen(observed)
+        viewed = self._viewed(observed)
         parts = []
         if self.initial_normalization is not None:
-            vectors = self.initial_normalization.encode(joined_vectors(seen, self.config.observed))
+            vectors = self.initial_normalization.encode(joined_vectors(viewed, self.config.observed))
             parts.append(self._dropped(vectors) if self.training else vectors)
         if self.images is not None:
-            parts.append(self.images.from_origins(observed[READ] if READ in observed else self.images(seen), seen))
+            parts.append(self.images.from_origins(observed[READ] if READ in observed else self.images(viewed), viewed))
         return torch.cat(parts, dim=-1)
 
     def of_images(self, observed: Observed) -> Tensor | None:
-        """Image encodings ``(batch, n)``, for methods that encode images once and vectors often; ``None`` without images."""
-        read: Tensor | None = None if self.images is None else self.images(self._seen(observed))
+        """Image encodings ``(batch, n)``, for methods that encode images once, vectors at every step; ``None`` without images."""
+        read: Tensor | None = None if self.images is None else self.images(self._viewed(observed))
         return read
 
-    def _seen(self, observed: Observed) -> Observed:
+    def _viewed(self, observed: Observed) -> Observed:
         read = READ in observed
         if self.view is not None:
             check_features(observed, _unread(self.domain.observed, read))
@@ -331,8 +331,8 @@ class ConceptModel(Shown, nn.Module, ABC):
 class TextConceptModel(ConceptModel):
     """A model whose concept space is the text encoder's.
 
-    Embeddings are centred on the training concepts and scaled to unit mean square, since language models' embeddings share a
-    large common part, which hides differences.
+    Embeddings are centred on the training concepts and scaled to unit mean square: embeddings of language models have a large
+    common component, which hides differences.
 
     Args:
         prepared: inputs with the encoder's embeddings.

@@ -105,7 +105,7 @@ def _ours() -> dict[str, str]:
 
 
 def load_method(name: str) -> Method:
-    """Load a method by name; ``UserError`` for an unknown name or another object."""
+    """Load a method by name; ``UserError`` for an unknown name, or an object that is no method."""
     offered = _ours() if name in SHIPPED else _offered()
     if name not in offered:
         raise UserError(f"method: expected one of {', '.join(method_names())}, found {short(name)!r}")

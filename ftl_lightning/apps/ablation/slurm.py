@@ -65,7 +65,7 @@ def script(wave: Wave, plan: Path, folder: Path, jobs: int = 0, options: Mapping
     name = re.sub(r"[^\w.-]+", "_", Path(plan.stem).stem)
     lines = {"job-name": name, "array": f"1-{jobs}", "ntasks": "1", _CPUS: f"{cpus}", **_booked(wave.cells), **_checked(options)}
     header = [f"#SBATCH --{name}={value}" if value else f"#SBATCH --{name}" for name, value in lines.items()]
-    trusted = [word for name in sorted(trust.vouched()) for word in (trust.OPTION, name)]
+    trusted = [word for name in sorted(trust.trusted_names()) for word in (trust.OPTION, name)]
     only = f"[{', '.join(map(str, wave.numbers))}]"
     command = [sys.executable, "-m", "ftl_lightning", "ablate", "--config", str(plan), "--only", only, *trusted]
     body = [

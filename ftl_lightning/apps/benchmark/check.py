@@ -187,7 +187,7 @@ def recompute(
             # Given models default to the shipped models.
             model = SHIPPED if run.origin == GIVEN and not candidate.model else candidate.model
             again = replace(candidate, model=model, work=Path(work)).run(suites[run.suite], run.seed)
-            found = list(differences(run, again, suites[run.suite], alike))
-            say(f"{run.suite}, seed {run.seed}: {f'{len(found)} numbers differ' if found else 'the same'}")
-            all_differences += found
+            differing = list(differences(run, again, suites[run.suite], alike))
+            say(f"{run.suite}, seed {run.seed}: {f'{len(differing)} numbers differ' if differing else 'the same'}")
+            all_differences += differing
     return all_differences

@@ -1,7 +1,7 @@
 """Four families of behaviour that resemble user data: no simulator, no initial states, concepts that are words or numbers.
 
-Each family is a domain. Kinds of pictures, reaches and beats are defined by a number. A sample is right if the nearest of many
-samples of all kinds belongs to the goal.
+Each family is a domain. A number defines a kind of pictures, reaches or beats. A sample is correct if its nearest neighbour among
+many samples of all kinds is of the goal's kind.
 """
 
 import itertools
@@ -38,8 +38,8 @@ def _number(kind: str) -> int:
 
 def pictures(kind: str, count: int, seed: int) -> NDArray[np.float32]:
     """Pictures of polylines with three to five corners, drawn with a soft pen: ``(count, 1, 64)``. A state has 8 x 8 grey values
-    from 0 to 16, row by row. The kind ``'picture NUMBER'`` determines the corners, the seed slant, size, place and width of each
-    picture.
+    from 0 to 16, row by row. The kind ``'picture NUMBER'`` determines the corners; the seed determines slant, size, place and width
+    of each picture.
     """
     rng, shape = _rng("pictures", kind, seed), _rng("picture", _number(kind))
     corner = shape.uniform(0.12, 0.88, (int(shape.integers(3, 6)), 2))
@@ -61,9 +61,9 @@ def pictures(kind: str, count: int, seed: int) -> NDArray[np.float32]:
 
 
 def reaches(kind: str, count: int, seed: int) -> NDArray[np.float32]:
-    """Reaches of a hand through three places, with a gripper that closes on the way: ``(count, 50, 4)``. Columns are x, y and z in
-    metres, mostly within 0.6 of the origin, and the opening from 0 to 80 mm. The kind ``'reach NUMBER'`` determines the places and
-    when the gripper closes, the seed start and deviations of each reach.
+    """Hand trajectories through three waypoints, with a gripper that closes on the way: ``(count, 50, 4)``. Columns are x, y and z
+    in metres, mostly within 0.6 of the origin, and the opening from 0 to 80 mm. The kind ``'reach NUMBER'`` determines waypoints
+    and time of closing; the seed determines start and deviations of each trajectory.
     """
     shape, rng, s, drawn = _rng("a reach", _number(kind)), _rng("reaches", kind, seed), np.linspace(0, 1, 50), []
     goals, closing, height = shape.uniform(-0.4, 0.4, (3, 3)), shape.uniform(0.2, 0.8), shape.uniform(0.05, 0.3)
@@ -80,8 +80,8 @@ def reaches(kind: str, count: int, seed: int) -> NDArray[np.float32]:
 
 
 def beats(kind: str, count: int, seed: int) -> NDArray[np.float32]:
-    """Beats of one column, four waves over a wandering line: ``(count, 120, 1)``, in millivolts, mostly within 3 of zero. The kind
-    ``'beat NUMBER'`` determines the waves, the seed pace, size and wandering of each beat.
+    """Heartbeats of four waves on a drifting baseline: ``(count, 120, 1)``, in millivolts, mostly within 3 of zero. The kind
+    ``'beat NUMBER'`` determines the waves; the seed determines pace, size and drift of each beat.
     """
     shape, rng, s, drawn = _rng("a beat", _number(kind)), _rng("beats", kind, seed), np.linspace(0, 1, 120), []
     place, width, height = np.sort(shape.uniform(0.1, 0.9, 4)), shape.uniform(0.015, 0.08, 4), shape.normal(0, 1, 4)

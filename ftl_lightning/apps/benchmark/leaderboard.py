@@ -51,7 +51,7 @@ def read_submissions(folder: Path) -> list[Submission]:
 
 
 def leaderboard(submissions: Sequence[Submission]) -> str:
-    """The page, in Markdown."""
+    """Leaderboard page in Markdown."""
     suites = [load_suite(name) for name in suite_names()]
     chosen = [suite for suite in suites if any(suite.name in entry.suites for entry in submissions)]
     parts = [HEAD, BEGIN, *(_section(suite, submissions) for suite in chosen)]

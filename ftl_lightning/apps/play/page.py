@@ -60,8 +60,8 @@ def page(nonce: str, offline: bytes | None = None) -> str:
 
 
 def request_key(path: str, body: Any = None) -> str:
-    """Key of a request among precomputed answers, as the page computes it: path and query, then the body of a POST with keys in the
-    page's order and whole numbers without a point, as in JavaScript.
+    """Key of a request to a precomputed answer, equal to the page's: path and query, then the JSON body of a POST, formatted as by
+    JavaScript.
     """
     if body is None:
         return path
@@ -83,8 +83,7 @@ def pairs_of(concepts: Sequence[dict[str, Any]], named: Sequence[tuple[str, str]
     if named:
         by_name = {concept["name"]: concept["id"] for concept in concepts}
         for name in itertools.chain(*named):
-            found = f"{short(name)!r}; the verb concepts lists them"
-            require(name in by_name, "pairs", "concepts of the model", found)
+            require(name in by_name, "pairs", "concepts of the model", f"{short(name)!r}; the verb concepts lists them")
         return [(by_name[first], by_name[second]) for first, second in named]
     learned = [concept["id"] for concept in concepts if concept["kind"] != "training"]
     training = [concept["id"] for concept in concepts if concept["kind"] == "training"]

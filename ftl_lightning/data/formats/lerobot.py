@@ -210,7 +210,7 @@ def _by_number(path: Path, number: str, value: str, kind: type) -> dict[int, Any
 
 
 def write_lerobot(demonstrations: Demonstrations, folder: str | Path, fps: int = 10) -> None:
-    """Write a data set for LeRobot and :func:`read_lerobot`, whole or not at all.
+    """Write a data set for LeRobot and :func:`read_lerobot`, atomically.
 
     Demonstrations have no actions. The action of a frame is the next state, of the last frame its state, as for a robot controlled
     by positions. Scenes and features known only at the start are repeated in each frame.

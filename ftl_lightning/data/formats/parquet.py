@@ -28,14 +28,14 @@ def read_columns(
 
     Args:
         root, pattern: folder, and pattern of its files.
-        shapes: shape of a row of each column, by name; a shape of one number may be stored without a list.
+        shapes: shape of a row of each column, by name; a shape of a single number may be stored without a list.
         whole: names of columns of whole numbers (int64).
 
     Returns:
         Numbers by name, ``(row, *shape)``, or ``(row,)`` if whole; missing numbers are NaN.
 
     Raises:
-        UserError: naming the file, if it is missing, damaged, much larger than its bytes, or has other columns.
+        UserError: naming the file, if it is missing, damaged, unpacks to far more than its size, or has other columns.
     """
     paths = visible(root, pattern)
     require(1 <= len(paths) <= MOST_TENSORS, str(root), f"Parquet files {pattern}, at most {MOST_TENSORS}", str(len(paths)))
@@ -148,7 +148,7 @@ def _numbers(place: str, column: pa.ChunkedArray, shape: tuple[int, ...], whole:
         if isinstance(values, pa.ExtensionArray):
             values = values.storage
         if not _is_list(values.type):
-            break  # a vector of one number is the number itself
+            break  # a vector of a single number is the number itself
         even = not len(values) or pc.unique(pc.list_value_length(values)).to_pylist() == [size]
         require(even, place, f"{size} numbers in each list", "other lists")
         values = values.flatten()

@@ -47,8 +47,8 @@ def progressed(goal: str, states: Tensor, starts: InitialStates | None) -> Tenso
 def reached(goal: str, rollout: Rollout) -> dict[str, Tensor]:
     """Outcomes of episodes ``(episode,)`` of bool (paper, closed loop).
 
-    ``success``: the agent ends within :data:`~ftl_lightning.domains.agent.scenes.REACH` of the target and never was as near to the
-    distractor; ``distractor``: it was; ``progress``: it ends nearer to the target.
+    ``distractor``: the agent comes within :data:`~ftl_lightning.domains.agent.scenes.REACH` of the distractor. ``success``: it ends
+    within that distance of the target without ``distractor``. ``progress``: it ends nearer to the target than it starts.
     """
     world = rollout.observed[scenes.OBSERVED]
     to_target, to_distractor = _to_each(goal, world[..., :3], world[:, 0])

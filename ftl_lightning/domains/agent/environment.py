@@ -85,7 +85,7 @@ class AgentEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         self._steps = 0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Seen, dict[str, Any]]:
-        """Build a scene: ``options['scene']``, 52 numbers, or one drawn for ``options['task']`` (default 'go to red object').
+        """Build a scene: ``options['scene']``, 52 numbers, else a scene drawn for ``options['task']`` (default 'go to red object').
 
         Raises:
             UserError: for a scene of the wrong size, with overlapping bodies, or with numbers that are not finite.

@@ -82,7 +82,7 @@ Look = tuple[str, str]  # colour and shape
 
 @dataclass(frozen=True)
 class Goal:
-    """Look of the target: a key of :data:`COLOURS` and one of :data:`SHAPES`; ``None`` for any."""
+    """Target attributes: a key of :data:`COLOURS` and a key of :data:`SHAPES`; ``None`` for any."""
 
     colour: str | None
     shape: str | None

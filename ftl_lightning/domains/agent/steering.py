@@ -1,4 +1,4 @@
-"""Drives led by hand: the agent follows the drawn route in the same physics as the expert."""
+"""Demonstrations from routes drawn by hand, which the agent follows in the expert's simulator."""
 
 import numpy as np
 import torch
@@ -39,7 +39,7 @@ def scene(task: str, seed: int) -> Scene:
 def record(scene_before: Scene, path: Numbers, seconds: Numbers) -> Demonstrations:
     """Drive at the expert's speed along the drawn route ``(step, 1, 2)`` in metres, to just before the first object on it.
 
-    The route is clipped to the picture; the speed of the hand is ignored, as it is not a property of the drive.
+    The route is clipped to the picture; the speed of drawing is ignored.
 
     Raises:
         UserError: for a route shorter than :data:`SHORTEST`, or without the simulator.
@@ -50,7 +50,7 @@ def record(scene_before: Scene, path: Numbers, seconds: Numbers) -> Demonstratio
     lower, upper = np.array(SEEN).T
     hand = np.concatenate((start, path[:, 0].clip(lower, upper)))
     length = reached(hand)[-1]
-    require(length >= SHORTEST, "way", f"one of at least {SHORTEST:g} m", f"{length:.2f} m; lead the agent further")
+    require(length >= SHORTEST, "way", f"at least {SHORTEST:g} m", f"{length:.2f} m; lead the agent further")
     way = _before_objects(smoothed(hand, BLUR), object_positions(world)[0].double().numpy()[:, PLANE])
     env = environment()
     try:

@@ -29,7 +29,7 @@ MARGIN, MAX_ASPECT = 20.0, 1.8
 AREA, PAGE = 9.0, 13.0
 """Area of a panel in square inches and width of a figure in inches."""
 PLAN_REACH = 25.0
-"""Distance from the driven path, in metres, within which plans extend the window of a film."""
+"""Maximum distance in metres from the driven path at which plans extend the window of a film."""
 LEGEND = (
     Patch(color=EGO, label="controlled vehicle, its way"),
     Patch(color=OTHER, label="other vehicles"),

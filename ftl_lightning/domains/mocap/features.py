@@ -37,7 +37,7 @@ def places(relative: Tensor) -> Tensor:
 
 
 def sizes(relative: Tensor) -> Tensor:
-    """Total bone length of the body half of each bone ``(sample, frame, 14, 3)``: ``(sample, 1, 14, 1)``."""
+    """Size of each bone's body half ``(sample, 1, 14, 1)``: the sum of its bone lengths, from bones ``(sample, frame, 14, 3)``."""
     length = torch.linalg.vector_norm(relative, dim=-1).mean(dim=1, keepdim=True)
     half = [length[..., list(part)].sum(dim=-1) for part in (LOWER, UPPER)]
     return torch.stack([half[joint in UPPER] for joint in range(JOINTS)], dim=-1)[..., None].clamp_min(1e-3)

@@ -196,7 +196,7 @@ class Judge(nn.Module):
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read a judge; raise a ``UserError`` for a file that is missing, damaged or of another form."""
+        """Read a judge; raise a ``UserError`` for a file that is missing, damaged or of another kind."""
         remedy = "take it from the project's repository, or make it with benchmarks/experiments/mocap_judge.py"
         require(Path(path).is_file(), str(path), "the judge of motion", f"nothing; {remedy}")
         tensors, header = load_tensors(path, KIND)

@@ -37,11 +37,13 @@ Place = NDArray[np.float64]
 WIDEST = 0.8  # Maximum angle in radians of a pushing hand from the line behind the circle, seen from the circle
 FARTHEST = 0.12  # Maximum distance in metres of a pushing hand from the circle's centre
 STEERING = 3.0
-"""Deviation of the hand's direction from the circle's, per radian of the hand's angle; above 1, it returns to the line behind."""
+"""Steering gain: deviation of the hand's direction from the circle's, per radian of the hand's angle. Above 1, the hand returns to
+the line behind the circle."""
 LOW = 0.006  # Height in metres above push height below which a hand is low
 CLEAR = 0.065  # Travel height in metres above push height, above all objects
 NEAR, FUNNEL = 0.015, 0.03
-"""Metres from the point of descent: radius in which the hand may be low (above the spread between demonstrations), and funnel."""
+"""Radius in metres around the point of descent in which the hand may be low (wider than the spread of demonstrations), and width of
+the ring around it in which the hand descends."""
 ACROSS, DOWN, UP = 0.016, 0.011, 0.014  # Maximum metres per step sideways, down and up
 AHEAD = 0.05  # Distance in metres of the circle's next goal on the path around the bowl
 
@@ -112,8 +114,8 @@ def _tangent(centre: Place, place: Place, turn: float) -> float:
     return math.atan2(off[1], off[0]) - turn * math.acos(RING / distance)
 
 
-PAST = 8  # Steps that a push continues after success: small position errors must not stop a policy before the triangle
-STAY = 4  # Steps of rest after a task, so that plans end at rest
+PAST = 8  # Steps of a push after success: a policy with small position errors must not stop before the triangle
+STAY = 4  # Steps at rest after a task, so that plans end at rest
 CLOSED = 0.0
 PUSH_HEIGHT = 0.014  # Hand height in metres above the surface under the circle during a push
 GRASP_HEIGHT = 0.016
@@ -125,13 +127,15 @@ TREMBLE = 0.0003  # Standard deviation of the hand noise per step, in metres
 SLIPS, SLIP = 0.04, (0.006, 0.018)
 """Slip probability per step of a push, and range of sizes in metres: recovery is learned from slips (Laskey et al., 2017)."""
 RETURN = 0.8  # Share of the hand's deviation from its path that remains a step later
-MISLAID = 0.6  # Recoveries: probability that the circle is moved
+MISLAID = 0.6  # Recoveries: probability that the circle is displaced
 LYING, RISING, OVER = 0.5, 0.4, 0.03
-"""Recoveries: probability of a low hand; that any other is beside the circle; minimum metres above push height of one over it."""
+"""Recoveries: probability of a low hand; probability that a higher hand is beside the circle; minimum height in metres above push
+height of a hand over the circle."""
 ASTRAY, REACHED = ((0.32, 0.70), (-0.28, 0.28)), ((0.26, 0.77), (-0.35, 0.35))  # Recoveries: x and y ranges of circle and hand
 OPENED, HIGHEST = 0.5, 0.16  # Recoveries of picks: probability of an open hand, and maximum hand height in metres above push height
-AROUND, ROOM, FARTHEST_PUSH = (0.034, 0.08), 0.012, 0.33
-"""Recoveries, in metres: range from hand to circle; minimum gap between circle and others; maximum from circle to push target."""
+AROUND, ROOM, LONGEST_PUSH = (0.034, 0.08), 0.012, 0.33
+"""Recoveries: range of distances from hand to circle, minimum gap from circle to other objects, maximum distance from circle to the
+target of a push; in metres."""
 APART_FROM = 0.12  # Centre distance in metres between an object and the circle placed beside it; leaves room for open fingers
 
 Moves = Generator[Place, None, None]  # Commands (4,) per step: x, y, z and gripper opening
@@ -146,7 +150,7 @@ class Style:
     aside: float
     hover: float  # travel height in metres
     grasp: Place  # x and y of the grasp relative to the circle's centre, in metres
-    place: Place  # x and y of the final position relative to the goal, as a fraction (-1..1) of the allowed spread
+    release: Place  # x and y of the final position relative to the goal, -1 to 1 times the spread of the task
 
 
 def style(rng: np.random.Generator) -> Style:
@@ -157,7 +161,7 @@ def style(rng: np.random.Generator) -> Style:
         aside=float(rng.uniform(-ASIDE, ASIDE)),
         hover=float(rng.uniform(0.11, 0.16)),
         grasp=rng.uniform(-0.004, 0.004, 2),
-        place=rng.uniform(-1, 1, 2),
+        release=rng.uniform(-1, 1, 2),
     )
 
 
@@ -230,12 +234,12 @@ def _target(expert: _Expert) -> tuple[Place, float]:
     scene, how = expert.env.scene, expert.how
     if expert.task in (TO_BOOK, TO_WHITE):
         name, spread = (BOOK, 0.02) if expert.task == TO_BOOK else (WHITE, 0.012)
-        return scene[COLUMNS[name]][1:3].astype(np.float64) + spread * how.place, HEIGHT[name]
+        return scene[COLUMNS[name]][1:3].astype(np.float64) + spread * how.release, HEIGHT[name]
     # The side of the object where the circle lay, which is invariant to rotations of the scene.
     thing = scene[COLUMNS[TARGET[expert.task]]][1:3].astype(np.float64)
     along = expert.circle()[:2] - thing
     along /= np.linalg.norm(along)
-    return thing + (APART_FROM + 0.005 * how.place[0]) * along + 0.01 * how.place[1] * np.array([-along[1], along[0]]), 0.0
+    return thing + (APART_FROM + 0.005 * how.release[0]) * along + 0.01 * how.release[1] * np.array([-along[1], along[0]]), 0.0
 
 
 def _push(expert: _Expert, height: float) -> Moves:
@@ -265,9 +269,9 @@ def _straight(expert: _Expert, height: float) -> Moves:
 
 
 def led_astray(env: "TableTopEnvironment", task: str, rng: np.random.Generator) -> dict[str, NDArray[Any]]:
-    """Start a recovery from a failure: the hand on any side of the circle, low or above it, open or closed and empty in picks.
+    """Start a recovery from a failure: the hand on any side of the circle, low or above it; in picks empty, open or closed.
 
-    With probability :data:`MISLAID` the circle lies elsewhere, also outside its initial range. Open hands are above it.
+    With probability :data:`MISLAID` the circle is displaced, also outside its initial range. Open hands are above the circle.
     """
     circle, others = env.places()[CIRCLE], {name: env.outline(name) for name in env.bodies.objects if name != CIRCLE}
     below, picks = support(env.scene, CIRCLE), task not in PUSHES
@@ -286,6 +290,6 @@ def led_astray(env: "TableTopEnvironment", task: str, rng: np.random.Generator) 
         height = below + PUSH_HEIGHT + (0.0 if low else rng.uniform(0, OVER) if rising else rng.uniform(OVER, highest))
         finger = outline(CIRCLE, float(hand[0]), float(hand[1]), 0.0)
         free = all(gap(shape, obstacle) >= ROOM and gap(finger, obstacle) >= APART for obstacle in others.values())
-        far = not picks and np.linalg.norm(place - env.places()[TARGET[task]][:2]) > FARTHEST_PUSH
+        far = not picks and np.linalg.norm(place - env.places()[TARGET[task]][:2]) > LONGEST_PUSH
         if free and not far and all(low < value < high for value, (low, high) in zip(hand, REACHED, strict=True)):
             return env.put(np.array([*hand, height]), place, OPEN if opened else CLOSED)
