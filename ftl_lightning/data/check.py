@@ -120,12 +120,12 @@ def check(demonstrations: Demonstrations) -> tuple[Finding, ...]:
     """
     few = Finding("three to five demonstrations are usual; fewer do not show which of them is odd", "note")
     findings = [*([few] if len(demonstrations) < 3 else []), *_constant(demonstrations)]
-    left = list(range(len(demonstrations)))
+    remaining = list(range(len(demonstrations)))
     for look in (_lengths, _stills, _units, _duplicates, _jumps, _outliers):
-        reported = [finding.among(left) for finding in look(demonstrations.rows(left))]
+        reported = [finding.among(remaining) for finding in look(demonstrations.rows(remaining))]
         findings += reported
         faulty = {row for finding in reported for row in (finding.rows[1:] if look is _duplicates else finding.rows)}
-        left = [row for row in left if row not in faulty] or left
+        remaining = [row for row in remaining if row not in faulty] or remaining
     return tuple(sorted(findings, key=lambda finding: finding.severity == "note"))
 
 
@@ -192,22 +192,22 @@ def _constant(demonstrations: Demonstrations) -> Iterator[Finding]:
 
 def _duplicates(demonstrations: Demonstrations) -> Iterator[Finding]:
     """Find copies by states and observed features."""
-    paths, apart = _paths(demonstrations), distances(demonstrations)
-    usual = float(_pairs(apart).median()) if len(paths) > 2 else 1.0
+    paths, gaps = _paths(demonstrations), distances(demonstrations)
+    usual = float(_pairs(gaps).median()) if len(paths) > 2 else 1.0
     for values in demonstrations.observed.values():
         flat = values.double().flatten(1)
         differ = (flat[:, None] - flat).abs() > ALIKE * flat.std(dim=0, correction=0)
-        apart = apart.masked_fill(differ.any(dim=2), torch.inf)
+        gaps = gaps.masked_fill(differ.any(dim=2), torch.inf)
     size = min(len(path) for path in paths) * paths[0].shape[1]
     limit = max(ALIKE * usual if size >= ENOUGH else 0.0, SAME)
-    left = list(range(len(paths)))
-    while left:
-        first, *rest = left
-        copies = [row for row in rest if apart[first, row] <= limit]
+    remaining = list(range(len(paths)))
+    while remaining:
+        first, *rest = remaining
+        copies = [row for row in rest if gaps[first, row] <= limit]
         if copies:
             exact = all(torch.equal(paths[first], paths[row]) for row in copies)
-            yield Finding("are the same" if exact else "are nearly the same; they count as one", rows=(first, *copies))
-        left = [row for row in rest if row not in copies]
+            yield Finding("are the same" if exact else "are nearly the same; they count once", rows=(first, *copies))
+        remaining = [row for row in rest if row not in copies]
 
 
 def _stills(demonstrations: Demonstrations) -> Iterator[Finding]:
@@ -331,7 +331,7 @@ def _far(points: Tensor, row: int) -> tuple[float, float]:
     others = _others(range(len(points)), row)
     all_spread, spread = (part.flatten(0, 1).std(dim=0, correction=0) for part in (points, points[others]))
     scale = torch.maximum(spread, 0.1 * all_spread)
-    apart = _apart(points / torch.where(scale > SAME, scale, 1))
-    gaps, among = apart[row, others], _pairs(apart[others][:, others])
+    separations = _apart(points / torch.where(scale > SAME, scale, 1))
+    gaps, among = separations[row, others], _pairs(separations[others][:, others])
     closest = CLOSEST.get(len(points), 0.1)
     return float(gaps.median() / among.median().clamp(min=closest)), float(gaps.min() / among.max().clamp(min=closest))

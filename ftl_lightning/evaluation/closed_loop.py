@@ -175,7 +175,7 @@ def sampled_plans(
 
 
 def planner(model: ConceptModel, loop: ClosedLoop) -> Planner:
-    """The planner of the model's view, if it has one, else the domain's."""
+    """Planner of the model's view, else of the domain."""
     return model.view.act if model.view is not None and model.view.act is not None else loop.act
 
 

@@ -48,7 +48,7 @@ _CACHE: dict[Hashable, Any] = {}
 
 
 def _cached(key: Hashable, compute: Callable[[], T]) -> T:
-    """Value from the cache; the oldest value makes room for a new one."""
+    """Value from the cache, which drops its oldest value when full."""
     if key not in _CACHE:
         if len(_CACHE) >= KEPT:
             del _CACHE[next(iter(_CACHE))]
@@ -130,7 +130,7 @@ class Real:
         domain: domain of the task.
         count: number of generated plans.
         demonstrations: demonstrations of the task's concept; ``None`` if novelty does not apply.
-        fresh: two sets of ``count`` real samples, one to cover and the other as a reference line; ``None`` if there are none.
+        fresh: two sets of ``count`` real samples, to cover and as a reference line; ``None`` if the domain cannot draw any.
     """
 
     task: EvaluationTask

@@ -79,7 +79,7 @@ def _part(
 ) -> Tensor:
     """Plans ``(n, horizon, state)`` of some ``rows (n,)`` in :func:`sampled`; noise is drawn for all rows and selected."""
     concept, draw = concept.uncomposed, generator("cpu", seed)
-    whole, numbers = concept.draw(count, draw)
+    compositions, numbers = concept.draw(count, draw)
     shape = (count, model.config.horizon, model.config.state_dim)
 
     def noise() -> Tensor:
@@ -89,8 +89,8 @@ def _part(
     features = take(observed, rows.to(model.device))
     if concept.modes is None:
         return model.sample([concept], len(rows), how, [draw], features)[0]
-    each = [whole.row(number) for number in numbers[rows.to(numbers.device)].tolist()]
-    return model.sample(each, 1, how, [draw] * len(each), features)[:, 0]
+    modes = [compositions.row(number) for number in numbers[rows.to(numbers.device)].tolist()]
+    return model.sample(modes, 1, how, [draw] * len(modes), features)[:, 0]
 
 
 def plans_of(domain: Domain, states: Tensor, starts: InitialStates | None, provenance: Mapping[str, Any]) -> Demonstrations:

@@ -25,14 +25,14 @@ def sign_flip(parts: Sequence[float]) -> float:
     are at least as far from zero. ``parts`` are the contributions of the pairs to the mean difference.
     """
     moving = np.array([part for part in parts if abs(part) > ROUNDING])
-    far = abs(moving.sum()) - ROUNDING
+    threshold = abs(moving.sum()) - ROUNDING
     if len(moving) <= EXACT:
         sums = np.zeros(1)
         for part in moving:
             sums = np.concatenate((sums + part, sums - part))
-        return float(np.mean(np.abs(sums) >= far))
+        return float(np.mean(np.abs(sums) >= threshold))
     signs = np.random.default_rng(0).choice((-1.0, 1.0), (DRAWS, len(moving)))
-    return float((1 + np.sum(np.abs(signs @ moving) >= far)) / (DRAWS + 1))
+    return float((1 + np.sum(np.abs(signs @ moving) >= threshold)) / (DRAWS + 1))
 
 
 def holm(values: Sequence[float]) -> list[float]:

@@ -156,8 +156,8 @@ def component_tasks(domain: Domain) -> tuple[EvaluationTask, ...]:
 
 def settings(domain: Domain, rows: pd.DataFrame) -> list[str]:
     """Settings with results: training settings, the paper's, then others in order of appearance."""
-    apart = {task.setting for task in component_tasks(domain)}
-    measured = [setting for setting in dict.fromkeys(rows["setting"]) if setting not in apart]
+    separate = {task.setting for task in component_tasks(domain)}
+    measured = [setting for setting in dict.fromkeys(rows["setting"]) if setting not in separate]
     order = dict.fromkeys((*training_settings(domain), *_suite(domain, PAPER), *measured))
     return [setting for setting in order if setting in measured]
 

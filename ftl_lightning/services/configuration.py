@@ -92,7 +92,7 @@ def _plain(keys: object) -> dict[str, Any]:
 def _merged(path: Path, section: str | None, above: tuple[Path, ...]) -> Iterator[tuple[Path, dict[str, Any]]]:
     """Files with their keys, the section's after the others. ``above``: files that include this file."""
     if path.resolve() in (parent.resolve() for parent in above):
-        raise UserError(f"{above[-1]}: key '{DEFAULTS}': {path} builds on {above[-1]} itself; leave one of them out")
+        raise UserError(f"{above[-1]}: key '{DEFAULTS}': {path} builds on {above[-1]} itself; remove either from its list")
     keys = _read(path)
     names = keys.pop(DEFAULTS, None) or []
     valid = isinstance(names, list) and all(isinstance(name, str) for name in names)

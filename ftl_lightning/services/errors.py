@@ -62,7 +62,7 @@ def mistake_of_machine(error: BaseException) -> str | None:
     if isinstance(error, OSError):
         where = short(str(error.filename or "a file"), 150)
         reason = error.strerror or short(str(error))
-        return f"{where}: expected a place that can be read and written, found another ({reason}); choose another one"
+        return f"{where}: expected a place that can be read and written, found another ({reason}); choose another place"
     text = str(error)
     if isinstance(error, MemoryError) or any(words in text for words in _NO_MEMORY):
         return (

@@ -130,7 +130,7 @@ def _named(path: str | Path, key: str) -> str:
 
 
 def check_file(path: str | Path, key: str = "", kind: str = "file") -> None:
-    """Refuse an existing path that is no regular file or no folder, but a device, a pipe, a socket, or a link to one.
+    """Refuse an existing path of another kind, such as a device, a pipe, a socket, or a link to any of them.
 
     Args:
         path: path to write.

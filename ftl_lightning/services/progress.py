@@ -1,4 +1,4 @@
-"""Progress of long work: one moving bar in a terminal, a few plain lines elsewhere. Both go to standard error."""
+"""Progress of long work on standard error: a moving bar in a terminal, a few plain lines elsewhere."""
 
 import sys
 import time
@@ -78,7 +78,7 @@ def _display() -> "Progress":
         TimeElapsedColumn(),
         TimeRemainingColumn(),
         TextColumn("{task.fields[note]}", markup=False),
-        console=Console(stderr=True, soft_wrap=True),  # printed paths stay in one line
+        console=Console(stderr=True, soft_wrap=True),  # no line breaks in printed paths
         transient=True,
         # If standard output is a file, printed text must go there, not to the terminal.
         redirect_stdout=sys.stdout.isatty(),

@@ -92,7 +92,7 @@ def _remove_left(folder: Path, begin: str, end: str) -> None:
 
 @contextmanager
 def alone(folder: str | Path) -> Iterator[None]:
-    """Lock a folder, so that processes that change the same files in it wait for one another. It is made if missing."""
+    """Lock a folder, made if missing, so that processes change its files in turn."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     handle = os.open(folder, os.O_RDONLY)

@@ -96,7 +96,7 @@ class ConceptModel(Shown, nn.Module, ABC):
         generators: Sequence[torch.Generator],
         observed: Observed | None = None,
     ) -> Tensor:
-        """Sample behaviour for several compositions in one batch.
+        """Sample behaviour for several compositions in a single batch.
 
         Args:
             compositions: ``(K, ...)`` each; K may differ.
@@ -180,7 +180,7 @@ class ConceptModel(Shown, nn.Module, ABC):
         Args:
             rows: row of the demonstration of each window ``(row,)``.
             share: relative start of each window ``(row,)``, 0 to 1.
-            draw: generator of the perturbation, if the model is configured with one.
+            draw: generator of the perturbation, if configured.
         """
         plans = self.domain.plans
         starts = demonstrations.starts(rows, share, plans.exponent(self.window), self.window, plans.at_rest)
@@ -296,8 +296,8 @@ class ConceptModel(Shown, nn.Module, ABC):
 
     def of_images(self, observed: Observed) -> Tensor | None:
         """Image encodings ``(batch, n)``, for methods that encode images once, vectors at every step; ``None`` without images."""
-        read: Tensor | None = None if self.images is None else self.images(self._viewed(observed))
-        return read
+        encodings: Tensor | None = None if self.images is None else self.images(self._viewed(observed))
+        return encodings
 
     def _viewed(self, observed: Observed) -> Observed:
         read = READ in observed

@@ -324,12 +324,17 @@ class InversionData(pl.LightningDataModule):
         if domain == OWN:
             self.demonstrations = read_own(str(demonstrations))
         else:
-            known = load_domain(domain)
-            require(suite in known.concepts.suites, "data.suite", f"one of {', '.join(known.concepts.suites)}", repr(suite))
+            known_domain = load_domain(domain)
+            require(
+                suite in known_domain.concepts.suites,
+                "data.suite",
+                f"one of {', '.join(known_domain.concepts.suites)}",
+                repr(suite),
+            )
             if demonstrations is None:
-                self.demonstrations = self._drawn(known, suite, demonstrations_per_concept)
+                self.demonstrations = self._drawn(known_domain, suite, demonstrations_per_concept)
             else:
-                self.demonstrations = read_demonstrations(demonstrations, known)
+                self.demonstrations = read_demonstrations(demonstrations, known_domain)
         self.concepts = tuple(dict.fromkeys(self.demonstrations.concepts))
 
     def _drawn(self, domain: Domain, suite: str, count: int) -> Demonstrations:

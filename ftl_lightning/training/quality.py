@@ -99,8 +99,8 @@ class Inspection:
         """Figure of demonstrations above samples."""
         shown = slice(0, SHOWN)
         observed = bool(self.domain.observed)
-        known = self.starts.take(slice(0, len(self.demonstrations))) if observed else None  # initial states of samples, in turn
-        demonstrations = Drawn("demonstrations", self.demonstrations, known)
+        starts = self.starts.take(slice(0, len(self.demonstrations))) if observed else None  # initial states of samples, in turn
+        demonstrations = Drawn("demonstrations", self.demonstrations, starts)
         samples = Drawn("samples", self.samples[shown], self.starts.take(shown) if observed else None)
         return beside(self.domain.show, demonstrations, samples, f"{self.name}: {self}")
 

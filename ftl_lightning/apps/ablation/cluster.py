@@ -56,7 +56,7 @@ def cluster(address: str, attempt: Attempt, cells: Sequence[Cell] = ()) -> Itera
 def _connect(address: str) -> None:
     import ray
 
-    expected = "HOST:PORT of a cluster's head, and ablate called on one of its machines, in a folder that all of them share"
+    expected = "HOST:PORT of a cluster's head, and ablate called on a machine of the cluster, in a folder that all machines share"
     require("://" not in address, "address", expected, short(address))
     here = _here() if address in ("", "auto") else ""
     expected = "a Ray cluster that this machine is a node of"

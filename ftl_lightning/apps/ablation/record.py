@@ -101,15 +101,15 @@ def tell(results: str | Path, cells: Sequence[Cell], state: State, node: str = "
 
 def table(entries: Mapping[str, CellRecord], cells: Sequence[Cell]) -> Table:
     """Table of cells with state, machine, runs, seconds, and outcome or error; cells without an entry were never started."""
-    known = {cell.name: entries.get(cell.name, CellRecord()) for cell in cells}
-    shown = Table(title=count_states([entry.state for entry in known.values()]))
+    records = {cell.name: entries.get(cell.name, CellRecord()) for cell in cells}
+    states_table = Table(title=count_states([entry.state for entry in records.values()]))
     for name in ("cell", "state", "node", "runs", "seconds", "note"):
-        shown.add_column(name, justify="right" if name in ("runs", "seconds") else "left")
-    for name, entry in known.items():
+        states_table.add_column(name, justify="right" if name in ("runs", "seconds") else "left")
+    for name, entry in records.items():
         seconds = f"{entry.seconds:.0f}" if entry.seconds else ""
         runs = str(entry.runs or "")
-        shown.add_row(*(literal(text) for text in (name, entry.state, entry.node, runs, seconds, short(entry.note, 100))))
-    return shown
+        states_table.add_row(*(literal(text) for text in (name, entry.state, entry.node, runs, seconds, short(entry.note, 100))))
+    return states_table
 
 
 def count_states(states: Sequence[str]) -> str:
@@ -121,9 +121,9 @@ def count_states(states: Sequence[str]) -> str:
 
 def by_node(entries: Mapping[str, CellRecord], cells: Sequence[Cell]) -> list[str]:
     """Lines with the number of cells by state, for each machine."""
-    known = [entries[cell.name] for cell in cells if cell.name in entries]
-    nodes = sorted({entry.node for entry in known if entry.node})
-    return [f"{node}: {count_states([entry.state for entry in known if entry.node == node])}" for node in nodes]
+    records = [entries[cell.name] for cell in cells if cell.name in entries]
+    nodes = sorted({entry.node for entry in records if entry.node})
+    return [f"{node}: {count_states([entry.state for entry in records if entry.node == node])}" for node in nodes]
 
 
 def seconds_of(cell: Cell, entries: Mapping[str, CellRecord]) -> float | None:

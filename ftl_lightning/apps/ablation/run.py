@@ -33,11 +33,11 @@ def check(cells: Sequence[Cell]) -> None:
     """Check files, keys and encoder of each cell and, for ``invert``, domain, suites and model, before any cell starts. Raise
     UserError with all mistakes.
     """
-    made = {cell.options["model.output"] for cell in cells if cell.verb == "fit" and "model.output" in cell.options}
+    outputs = {cell.options["model.output"] for cell in cells if cell.verb == "fit" and "model.output" in cell.options}
     mistakes = {}
     for cell in cells:
         try:
-            _check(cell, made)
+            _check(cell, outputs)
         except (UserError, ArgumentError) as error:
             mistakes[cell.command] = " ".join(str(error).split())
     if mistakes:
@@ -168,8 +168,8 @@ def show_estimate(plan: Sequence[Sequence[Cell]], results: str, workers: int = 0
             advance()
             return not _is_done(cell, known)
 
-        left = [[cell for cell in cells if needed(cell)] for cells in plan]
-    say("\n".join(estimate(left, read_record(results), total, workers)))
+        to_run = [[cell for cell in cells if needed(cell)] for cells in plan]
+    say("\n".join(estimate(to_run, read_record(results), total, workers)))
 
 
 def _is_made(cell: Cell) -> bool:

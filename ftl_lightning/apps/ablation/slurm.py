@@ -36,13 +36,13 @@ class Wave:
 def waves(plan: Mapping[int, Sequence[Cell]]) -> list[Wave]:
     """Group stages by number: a group begins when a cell reads an output of the previous group, such as a pretrained model."""
     groups: list[list[int]] = []
-    made: set[str] = set()
+    outputs: set[str] = set()
     for number, cells in plan.items():
-        if not groups or any(_reads(cell, made) for cell in cells):
+        if not groups or any(_reads(cell, outputs) for cell in cells):
             groups.append([])
-            made = set()
+            outputs = set()
         groups[-1].append(number)
-        made |= {cell.options["model.output"] for cell in cells if "model.output" in cell.options}
+        outputs |= {cell.options["model.output"] for cell in cells if "model.output" in cell.options}
     grouped = [Wave(tuple(group), tuple(cell for number in group for cell in plan[number])) for group in groups]
     return [wave for wave in grouped if wave.cells]
 

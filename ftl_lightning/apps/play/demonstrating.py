@@ -69,11 +69,11 @@ class Demonstrating:
                 for row in finding.rows:
                     flags.setdefault(row, []).append(finding.text)
                 general += [] if finding.rows else [finding.text]
-        shown = [
+        entries = [
             {"id": number, "film": films(self._domain, entry)[0], "flags": flags.get(row, [])}
             for row, (number, entry) in enumerate(self._entries.items())
         ]
-        return {"demonstrations": shown, "check": general, "undo": bool(self._before), "wanted": WANTED}
+        return {"demonstrations": entries, "check": general, "undo": bool(self._before), "wanted": WANTED}
 
     def together(self, name: str) -> Demonstrations:
         """Demonstrations joined under the concept ``name``. Raise UserError if there are none."""

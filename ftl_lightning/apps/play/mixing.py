@@ -95,16 +95,16 @@ def samples(model: FewShot, mixture: Mixture, asked: Sample, tasks: Sequence[str
     goal = goal_of(judge, mixture.names, asked.task)
     if not asked.execute:
         plans = model.sample(mixture.mixed, asked.count, starts, seed=asked.seed, **how)
-        shown, verdict = judged(judge, plans, goal)
+        played, verdict = judged(judge, plans, goal)
     elif starts is None:
         raise UserError(f"execute: expected a model whose behaviour is executed, found {model.domain.name}")
     else:
         done = model.execute(mixture.mixed, starts, goal, seed=asked.seed, **how)
         outcomes: Mapping[str, Tensor] = model.domain.judge(goal, done.rollout) if goal else {}
-        shown = episode_films(model.domain, done.rollout, outcomes)
+        played = episode_films(model.domain, done.rollout, outcomes)
         verdict = ", ".join(f"{name} {value:.2f}" for name, value in done.outcomes.items())
         verdict = f"mean of {asked.count}: {verdict} ({goal})" if verdict else ""
-    return shown, verdict, Sampled(count=asked.count, seed=asked.seed, task=task, execute=asked.execute, **how)
+    return played, verdict, Sampled(count=asked.count, seed=asked.seed, task=task, execute=asked.execute, **how)
 
 
 def film(drawn: VectorFilm, right: bool | None = None, outcome: str = "") -> Json:
@@ -144,10 +144,10 @@ def episode_films(domain: Domain, rollout: Rollout, outcomes: Mapping[str, Tenso
         return []
     succeeded = outcomes.get(SUCCESS)
     booleans = {name: values for name, values in outcomes.items() if values.dtype == torch.bool}
-    shown = []
+    episodes = []
     for episode in range(len(rollout.failed)):
         words = ", ".join(name for name, values in booleans.items() if values[episode])
         words = words or (f"no {SUCCESS}" if SUCCESS in booleans else "")
         right = None if succeeded is None else bool(succeeded[episode])
-        shown.append(film(draw(rollout.take(episode, episode + 1)), right, words))
-    return shown
+        episodes.append(film(draw(rollout.take(episode, episode + 1)), right, words))
+    return episodes

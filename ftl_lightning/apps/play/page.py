@@ -99,8 +99,8 @@ def answers_of(
     """Answers to all requests of the page by request key, see :func:`pairs_of`; ``tell`` is called after each mixture."""
     state = workspace.state()
     mixes = pairs_of(state["concepts"], pairs)
-    shown = set(itertools.chain(*mixes))
-    concepts = [concept for concept in state["concepts"] if concept["id"] in shown]
+    identifiers = set(itertools.chain(*mixes))
+    concepts = [concept for concept in state["concepts"] if concept["id"] in identifiers]
     offline = {"weights": list(WEIGHTS), "pairs": [list(pair) for pair in mixes]}
     answers: dict[str, Any] = {"/api/state": state | {"concepts": concepts, "models": [], "offline": offline}}
     for concept in concepts:
@@ -155,8 +155,8 @@ def viewed(file: str, model: str = "") -> dict[str, Any]:
 
 
 def _state(title: str, notes: list[str], groups: list[Json]) -> dict[str, Any]:
-    shown = {"title": title, "told": notes, "groups": groups}
-    return {"title": title, "model": {"name": "", "title": "", "hash": ""}, "models": [], "viewer": shown, "offline": None}
+    viewer = {"title": title, "told": notes, "groups": groups}
+    return {"title": title, "model": {"name": "", "title": "", "hash": ""}, "models": [], "viewer": viewer, "offline": None}
 
 
 def _of_demonstrations(file: str) -> tuple[list[str], list[Json]]:

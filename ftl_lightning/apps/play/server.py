@@ -91,8 +91,8 @@ class Guard:
             if origin.lower().removeprefix("http://") not in self._hosts:
                 return f"origin: expected http://{min(self._hosts)}, found {short(origin)}"
         first = request.scope["path"] == "/"
-        given = request.query_params.getlist("token") if first else request.headers.getlist(TOKEN)
-        if len(given) != 1 or not hmac.compare_digest(given[0].encode(), self._token.encode()):
+        tokens = request.query_params.getlist("token") if first else request.headers.getlist(TOKEN)
+        if len(tokens) != 1 or not hmac.compare_digest(tokens[0].encode(), self._token.encode()):
             return "token: expected that of the address which the program printed, found another; open that address"
         return None
 

@@ -160,7 +160,7 @@ def _decompressed(key: str, packed: Tensor | None, shape: tuple[int, ...], leadi
         check_unpacked(size, len(packed), "images")
     reader = zlib.decompressobj()
     try:
-        content = bytearray(reader.decompress(packed.numpy().tobytes(), size + 1))  # one more, to reach the end
+        content = bytearray(reader.decompress(packed.numpy().tobytes(), size + 1))  # a byte more, to reach the end
     except zlib.error as error:
         raise UserError(f"{place}: expected compressed images, found damaged bytes ({error}); take another copy") from error
     longer = len(content) > size or bool(reader.unused_data)

@@ -66,8 +66,8 @@ def read_texts(path: Path, number: str, name: str) -> dict[int, str]:
         require(max(size, file.metadata.num_rows) <= MOST_TEXT, str(path), f"texts of at most {MOST_TEXT} bytes", str(size))
         schema = file.schema_arrow
         texts = [field.name for field in schema if pa.types.is_string(field.type) or pa.types.is_large_string(field.type)]
-        known = number in schema.names and texts and pa.types.is_integer(schema.field(number).type)
-        require(known, str(path), f"the columns {number!r} and {name!r}", short(", ".join(schema.names)))
+        has_texts = number in schema.names and texts and pa.types.is_integer(schema.field(number).type)
+        require(has_texts, str(path), f"the columns {number!r} and {name!r}", short(", ".join(schema.names)))
         table = file.read(columns=[number, name if name in texts else texts[0]])
         return {key: text for key, text in zip(*(column.to_pylist() for column in table.columns), strict=True) if text is not None}
 

@@ -92,10 +92,10 @@ class AgentEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         """
         super().reset(seed=seed)
         options = options or {}
-        if (given := options.get("scene")) is None:
+        if (scene := options.get("scene")) is None:
             draw = int(self.np_random.integers(2**31))
-            given = scenes.scenes(options.get("task", "go to red object"), 1, draw)[0]
-        self._initial = scenes.check(np.asarray(given)).copy()
+            scene = scenes.scenes(options.get("task", "go to red object"), 1, draw)[0]
+        self._initial = scenes.check(np.asarray(scene)).copy()
         self._steps = 0
         self._build()
         return self._observation(), {}

@@ -46,8 +46,8 @@ Plane = NDArray[np.float64]
 
 def route(start: Plane, goal: Plane, distractor: Plane) -> Plane:
     """Corners ``(2 or 3, 2)`` of the route from the start to just before the target, in x and z."""
-    way = goal - start
-    end = goal - STOP * way / np.linalg.norm(way)
+    direction = goal - start
+    end = goal - STOP * direction / np.linalg.norm(direction)
     share = np.clip((distractor - start) @ (end - start) / ((end - start) @ (end - start)), 0, 1)
     nearest = start + share * (end - start)
     gap = nearest - distractor

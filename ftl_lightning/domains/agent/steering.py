@@ -51,10 +51,10 @@ def record(scene_before: Scene, path: Numbers, seconds: Numbers) -> Demonstratio
     hand = np.concatenate((start, path[:, 0].clip(lower, upper)))
     length = reached(hand)[-1]
     require(length >= SHORTEST, "way", f"at least {SHORTEST:g} m", f"{length:.2f} m; lead the agent further")
-    way = _before_objects(smoothed(hand, BLUR), object_positions(world)[0].double().numpy()[:, PLANE])
+    route = _before_objects(smoothed(hand, BLUR), object_positions(world)[0].double().numpy()[:, PLANE])
     env = environment()
     try:
-        drive = follow(env, world[0].numpy(), way)
+        drive = follow(env, world[0].numpy(), route)
     finally:
         env.close()
     return drives(torch.from_numpy(drive)[None], torch.tensor([len(drive)]), ("",), {"generator": "by hand", "domain": NAME})
@@ -64,5 +64,5 @@ def _before_objects(way: Plane, objects: Plane) -> Plane:
     """Corners ``(corner, 2)`` of a route up to contact with an object, at most :data:`LONGEST` metres."""
     fine = at_even_steps(way, int(np.ceil(reached(way)[-1] / FINE)) + 1)
     near = (np.linalg.norm(fine[:, None] - objects, axis=-1) < STOP).any(axis=1) | (reached(fine) > LONGEST)
-    kept = fine[: int(near.argmax()) if near.any() else None]
-    return at_even_steps(kept, int(np.ceil(reached(kept)[-1] / CORNER)) + 1)
+    free = fine[: int(near.argmax()) if near.any() else None]
+    return at_even_steps(free, int(np.ceil(reached(free)[-1] / CORNER)) + 1)

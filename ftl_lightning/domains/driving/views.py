@@ -138,10 +138,10 @@ def _perturb(states: Tensor, observed: Observed, draw: torch.Generator | None) -
     else:
         noise = drawn(len(states), lambda n: torch.randn((n, 2), generator=draw, device=draw.device))
     ego = _vehicles(observed)[:, 0]
-    known = _known(observed) & (noise[:, 1:] > 0)
-    pace = (speed(ego)[:, :1] + torch.where(known, 0, PERTURBATION * noise[:, :1])).clamp(min=0)
+    is_known = _known(observed) & (noise[:, 1:] > 0)
+    pace = (speed(ego)[:, :1] + torch.where(is_known, 0, PERTURBATION * noise[:, :1])).clamp(min=0)
     now = torch.cat((ego[:, :3], pace * ego[:, 5:], ego[:, 5:]), dim=-1)
-    traffic = torch.cat((ego[:, :1] * known, now[:, 1:], observed[TRAFFIC][:, STATE:]), dim=-1)
+    traffic = torch.cat((ego[:, :1] * is_known, now[:, 1:], observed[TRAFFIC][:, STATE:]), dim=-1)
     return torch.cat((now[:, None], states[:, 1:]), dim=1), {**observed, TRAFFIC: traffic}
 
 

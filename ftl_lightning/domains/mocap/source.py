@@ -180,12 +180,12 @@ class Recorded:
         See :func:`validation_trials`. Mirroring exchanges left and right in the description; mirror images of which it is no
         training concept are omitted. A ``UserError`` if the folder has no trial for the split.
         """
-        wanted = [piece for piece in self._pieces if (piece.trial in self._validation) == (name == "validation")]
-        require(wanted, str(self.root), f"trials of the training concepts for {name}", "none; use more of the database")
+        chosen = [piece for piece in self._pieces if (piece.trial in self._validation) == (name == "validation")]
+        require(chosen, str(self.root), f"trials of the training concepts for {name}", "none; use more of the database")
         if name == "train":
-            reflected = [Piece(piece.trial, tasks.mirrored_text(piece.concept), mirrored(piece.states)) for piece in wanted]
-            wanted += [piece for piece in reflected if piece.concept in TRAINING_CONCEPTS]
-        return self._demonstrations(wanted, {"split": name})
+            reflected = [Piece(piece.trial, tasks.mirrored_text(piece.concept), mirrored(piece.states)) for piece in chosen]
+            chosen += [piece for piece in reflected if piece.concept in TRAINING_CONCEPTS]
+        return self._demonstrations(chosen, {"split": name})
 
     def draw(self, task: str, count: int, seed: int, workers: int = 1) -> Demonstrations:
         """Demonstrations of a concept, without replacement if there are enough.
@@ -281,8 +281,8 @@ def unused_reason(recordings: Recordings, trial: int) -> str:
 
 def training_pieces(recordings: Recordings) -> list[Piece]:
     """Pieces of training and validation trials, in the order of the trials."""
-    wanted = [trial for trial in range(len(recordings)) if not unused_reason(recordings, trial)]
-    return [Piece(trial, recordings.label[trial], states) for trial in wanted for states in pieces(recordings.trial(trial))]
+    used = [trial for trial in range(len(recordings)) if not unused_reason(recordings, trial)]
+    return [Piece(trial, recordings.label[trial], states) for trial in used for states in pieces(recordings.trial(trial))]
 
 
 def validation_trials(training: Sequence[Piece]) -> frozenset[int]:

@@ -79,13 +79,13 @@ def pushed(hand: Place, circle: Place, goal: Place, manner: Manner) -> Place:
 
 def _travelled(hand: Place, begin: Place, manner: Manner) -> Place:
     """Next position of a hand that descends at ``begin`` ``(2,)``: up first, down only above it."""
-    off = begin - hand[:2]
-    away = float(np.linalg.norm(off))
-    wanted = manner.height + CLEAR * min(1.0, max(0.0, (away - NEAR) / FUNNEL))
-    free = min(1.0, max(0.0, 1 - (wanted - hand[2]) / FUNNEL))  # a low hand rises before it moves
-    step = min(away, free * min(ACROSS * manner.haste, 0.35 * away + 0.0005))
-    rise = float(np.clip(wanted - hand[2], -DOWN * manner.haste, UP * manner.haste))
-    return np.array([*(hand[:2] + step * off / max(away, 1e-9)), hand[2] + rise])
+    offset = begin - hand[:2]
+    distance = float(np.linalg.norm(offset))
+    target = manner.height + CLEAR * min(1.0, max(0.0, (distance - NEAR) / FUNNEL))
+    free = min(1.0, max(0.0, 1 - (target - hand[2]) / FUNNEL))  # a low hand rises before it moves
+    step = min(distance, free * min(ACROSS * manner.haste, 0.35 * distance + 0.0005))
+    rise = float(np.clip(target - hand[2], -DOWN * manner.haste, UP * manner.haste))
+    return np.array([*(hand[:2] + step * offset / max(distance, 1e-9)), hand[2] + rise])
 
 
 def around(circle: Place, goal: Place, bowl: Place) -> Place:
@@ -93,8 +93,8 @@ def around(circle: Place, goal: Place, bowl: Place) -> Place:
     line = goal - circle
     distance = max(float(np.linalg.norm(line)), 1e-6)
     along = line / distance
-    off = bowl - circle
-    beside, passed = float(along[0] * off[1] - along[1] * off[0]), float(along @ off)
+    offset = bowl - circle
+    beside, passed = float(along[0] * offset[1] - along[1] * offset[0]), float(along @ offset)
     if abs(beside) >= RING or not 0 < passed < distance:
         return goal
     side = 1.0 if beside > 0 else -1.0  # counter-clockwise is 1
@@ -109,9 +109,9 @@ def around(circle: Place, goal: Place, bowl: Place) -> Place:
 
 def _tangent(centre: Place, place: Place, turn: float) -> float:
     """Angle on the ring around a centre of the tangent from a point."""
-    off = place - centre
-    distance = max(float(np.linalg.norm(off)), RING + 1e-6)
-    return math.atan2(off[1], off[0]) - turn * math.acos(RING / distance)
+    offset = place - centre
+    distance = max(float(np.linalg.norm(offset)), RING + 1e-6)
+    return math.atan2(offset[1], offset[0]) - turn * math.acos(RING / distance)
 
 
 PAST = 8  # Steps of a push after success: a policy with small position errors must not stop before the triangle
@@ -290,6 +290,6 @@ def led_astray(env: "TableTopEnvironment", task: str, rng: np.random.Generator) 
         height = below + PUSH_HEIGHT + (0.0 if low else rng.uniform(0, OVER) if rising else rng.uniform(OVER, highest))
         finger = outline(CIRCLE, float(hand[0]), float(hand[1]), 0.0)
         free = all(gap(shape, obstacle) >= ROOM and gap(finger, obstacle) >= APART for obstacle in others.values())
-        far = not picks and np.linalg.norm(place - env.places()[TARGET[task]][:2]) > LONGEST_PUSH
-        if free and not far and all(low < value < high for value, (low, high) in zip(hand, REACHED, strict=True)):
+        too_far = not picks and np.linalg.norm(place - env.places()[TARGET[task]][:2]) > LONGEST_PUSH
+        if free and not too_far and all(low < value < high for value, (low, high) in zip(hand, REACHED, strict=True)):
             return env.put(np.array([*hand, height]), place, OPEN if opened else CLOSED)

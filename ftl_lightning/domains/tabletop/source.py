@@ -111,11 +111,11 @@ def perform(
     actions: list[NDArray[np.float32]] = []
     ended, success = None, False
     for command in moves(env, task, how, height, feedback):
-        off = TREMBLE * rng.standard_normal(3)
+        noise = TREMBLE * rng.standard_normal(3)
         angle, size, slips = rng.uniform(-math.pi, math.pi), rng.uniform(*SLIP), rng.random() < SLIPS
         if slips and task in PUSHES and feedback:  # no recovery without feedback
-            off[:2] += size * np.array([math.cos(angle), math.sin(angle)])
-        actions.append((command + np.array([*off, 0.0])).astype(np.float32))
+            noise[:2] += size * np.array([math.cos(angle), math.sin(angle)])
+        actions.append((command + np.array([*noise, 0.0])).astype(np.float32))
         observation, _, terminated, truncated, info = env.step(actions[-1])
         commands.append(env.command.copy())
         images.append(observation[IMAGE])
