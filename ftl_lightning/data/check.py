@@ -21,10 +21,7 @@ MOST_NAMED = 6  # demonstrations to list individually
 POINTS = 32  # number of even times at which demonstrations are compared
 UNUSUAL = 3.0  # ratio to all other lengths that makes a length unusual
 DISCRETE = 5  # maximum number of distinct values of a discrete column, which may jump
-JUMP, JUMP_ALONE = (
-    3.0,
-    10.0,
-)  # Ratio of a jump to the largest other step, in several columns and in a single; times 4 for few steps
+JUMP, JUMP_ALONE = 3.0, 10.0  # ratio of a jump to the largest other step, in several columns or a single; times 4 for few steps
 WRAPPED = 0.8  # share of a column's range that a step covers where an angle wraps
 STILL = 1e-3  # maximum step that counts as standing still, as a share of the usual step
 FEW = 3  # minimum steps of a still stretch, and of the longest demonstration, for a fault

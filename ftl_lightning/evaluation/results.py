@@ -158,9 +158,8 @@ def rows(
         task = behaviour.task
         subject = {"domain": domain.name, "setting": task.setting, "task": task.name, "seed": hparams["seed"]}
         # Reference policies use demonstrations, reference plans do not.
-        demonstrations = (
-            demonstrations_of(task, module.demonstrated) if source["method"] not in domain.comparison.references else None
-        )
+        learns = source["method"] not in domain.comparison.references
+        demonstrations = demonstrations_of(task, module.demonstrated) if learns else None
         subject["demonstrations"] = 0 if demonstrations is None else len(demonstrations)
         for name, value in values.items():
             yield Row(**subject, **source, n=len(behaviour.states), metric=name, value=round(value, 6))

@@ -224,9 +224,7 @@ def library(model: str, training: Sequence[str], shipped: Path | None = None, fo
         if not place.is_dir():
             actual = "a file" if place.exists() else "nothing"
             raise UserError(f"folder: expected a folder of learned concepts, found {actual} at {short(str(place), 150)}")
-    files: list[tuple[Kind, Path]] = (
-        [("shipped", path) for path in visible(shipped, "*.safetensors")] if shipped is not None else []
-    )
+    files: list[tuple[Kind, Path]] = [] if shipped is None else [("shipped", path) for path in visible(shipped, "*.safetensors")]
     for place in (*places, concepts_folder()):
         files += [("saved", path) for pattern in ("*.safetensors", "*/*.safetensors") for path in visible(place, pattern)]
     entries, others, damaged = [Entry(text, "training", model) for text in training], 0, []

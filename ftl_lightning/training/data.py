@@ -324,17 +324,12 @@ class InversionData(pl.LightningDataModule):
         if domain == OWN:
             self.demonstrations = read_own(str(demonstrations))
         else:
-            known_domain = load_domain(domain)
-            require(
-                suite in known_domain.concepts.suites,
-                "data.suite",
-                f"one of {', '.join(known_domain.concepts.suites)}",
-                repr(suite),
-            )
+            loaded = load_domain(domain)
+            require(suite in loaded.concepts.suites, "data.suite", f"one of {', '.join(loaded.concepts.suites)}", repr(suite))
             if demonstrations is None:
-                self.demonstrations = self._drawn(known_domain, suite, demonstrations_per_concept)
+                self.demonstrations = self._drawn(loaded, suite, demonstrations_per_concept)
             else:
-                self.demonstrations = read_demonstrations(demonstrations, known_domain)
+                self.demonstrations = read_demonstrations(demonstrations, loaded)
         self.concepts = tuple(dict.fromkeys(self.demonstrations.concepts))
 
     def _drawn(self, domain: Domain, suite: str, count: int) -> Demonstrations:

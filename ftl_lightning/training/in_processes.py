@@ -43,26 +43,18 @@ def learned_in_processes(
         model: folder or name of the pretrained model.
         device: device to learn on; with several GPUs, processes take them in turn.
         demonstrations: demonstrations; their concept texts name the concepts.
-        processes: maximum number of processes, which is never above the number of concepts.
+        processes: maximum number of processes; never above the number of concepts.
 
     Raises:
         UserError: raised by the learner, or if a process ended early.
     """
     names = tuple(dict.fromkeys(demonstrations.concepts))
     devices = [torch.device("cuda", number) for number in range(torch.cuda.device_count())] if device.type == "cuda" else [device]
-    numbered = tuple(enumerate(names))
+    numbered, trusted = tuple(enumerate(names)), trust.trusted_names()
     with tempfile.TemporaryDirectory() as folder:
         demonstrations.save(Path(folder) / _DEMONSTRATIONS)
         shares = [
-            _Share(
-                folder,
-                model,
-                numbered[first::processes],
-                settings,
-                steps,
-                str(devices[first % len(devices)]),
-                trust.trusted_names(),
-            )
+            _Share(folder, model, numbered[first::processes], settings, steps, str(devices[first % len(devices)]), trusted)
             for first in range(min(processes, len(names)))
         ]
         # Spawned, since a forked process would share threads and devices.

@@ -110,9 +110,7 @@ class DrivingEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         lowest = min(risks.values(), default=1)
         if lowest == 1:
             return int(self.simulation.action_type.actions_indexes["SLOWER"])
-        candidates = [
-            (decision, distance) for decision, distance in zip(there, distances, strict=True) if risks.get(decision) == lowest
-        ]
+        candidates = [pair for pair in zip(there, distances, strict=True) if risks.get(pair[0]) == lowest]
         closest = min(distance for _, distance in candidates)
         if len(wish) == 1 and int(wish[0]) in dict(candidates):
             return int(wish[0])

@@ -37,13 +37,11 @@ Place = NDArray[np.float64]
 WIDEST = 0.8  # Maximum angle in radians of a pushing hand from the line behind the circle, seen from the circle
 FARTHEST = 0.12  # Maximum distance in metres of a pushing hand from the circle's centre
 STEERING = 3.0
-"""Steering gain: deviation of the hand's direction from the circle's, per radian of the hand's angle. Above 1, the hand returns to
-the line behind the circle."""
+"""Steering gain: turn of the hand's direction per radian of its angle; above 1, the hand returns to the line behind the circle."""
 LOW = 0.006  # Height in metres above push height below which a hand is low
 CLEAR = 0.065  # Travel height in metres above push height, above all objects
 NEAR, FUNNEL = 0.015, 0.03
-"""Radius in metres around the point of descent in which the hand may be low (wider than the spread of demonstrations), and width of
-the ring around it in which the hand descends."""
+"""Radius in metres around the point of descent in which the hand may be low, and width of the ring in which it descends."""
 ACROSS, DOWN, UP = 0.016, 0.011, 0.014  # Maximum metres per step sideways, down and up
 AHEAD = 0.05  # Distance in metres of the circle's next goal on the path around the bowl
 
@@ -129,13 +127,11 @@ SLIPS, SLIP = 0.04, (0.006, 0.018)
 RETURN = 0.8  # Share of the hand's deviation from its path that remains a step later
 MISLAID = 0.6  # Recoveries: probability that the circle is displaced
 LYING, RISING, OVER = 0.5, 0.4, 0.03
-"""Recoveries: probability of a low hand; probability that a higher hand is beside the circle; minimum height in metres above push
-height of a hand over the circle."""
+"""Recoveries: probability of a low hand; of a higher hand beside the circle; else minimum metres above push height, over it."""
 ASTRAY, REACHED = ((0.32, 0.70), (-0.28, 0.28)), ((0.26, 0.77), (-0.35, 0.35))  # Recoveries: x and y ranges of circle and hand
 OPENED, HIGHEST = 0.5, 0.16  # Recoveries of picks: probability of an open hand, and maximum hand height in metres above push height
 AROUND, ROOM, LONGEST_PUSH = (0.034, 0.08), 0.012, 0.33
-"""Recoveries: range of distances from hand to circle, minimum gap from circle to other objects, maximum distance from circle to the
-target of a push; in metres."""
+"""Recoveries, in metres: range from hand to circle, minimum gap from circle to other objects, maximum from circle to target."""
 APART_FROM = 0.12  # Centre distance in metres between an object and the circle placed beside it; leaves room for open fingers
 
 Moves = Generator[Place, None, None]  # Commands (4,) per step: x, y, z and gripper opening
