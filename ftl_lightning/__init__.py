@@ -1,7 +1,7 @@
 """Few-shot task learning through inverse generative modelling (Netanyahu et al., 2024) on PyTorch Lightning."""
 
 # Nothing is imported here but what is asked for: the command line starts without PyTorch, and `python -m ftl_lightning` takes the
-# current folder off Python's path before any module could be found in it.
+# current folder off Python's path before any module could be imported from it.
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from ftl_lightning.data.demonstrations import Demonstrations

@@ -73,7 +73,7 @@ def test_in_a_terminal_bars_share_a_display_that_is_gone_at_the_end(monkeypatch:
             assert [task.completed for task in progress._SCREEN.display.tasks] == [0, 5]
         advance(2, "loss 1")
         assert [task.completed for task in progress._SCREEN.display.tasks] == [2]
-        assert progress._SCREEN.display.tasks[0].fields["told"] == "loss 1"
+        assert progress._SCREEN.display.tasks[0].fields["note"] == "loss 1"
     assert progress._SCREEN.display is None
     last = terminal.getvalue().splitlines()[-1]
     assert "fit: 2 steps, 0:0" in last

@@ -180,7 +180,7 @@ def test_demonstrations_go_along_where_they_are_asked_for(scenes: FewShot, five:
     learned.save_pretrained("shared", demonstrations=True)
     assert Demonstrations.load("shared/demonstrations.safetensors").hash == five.hash
     assert "`demonstrations.safetensors`" in Path("shared/README.md").read_text()
-    with pytest.raises(UserError, match="demonstrations: expected a concept that was learned here, found one from a file"):
+    with pytest.raises(UserError, match="demonstrations: expected a concept that was learned here, found a concept from a file"):
         scenes.load("shared").save_pretrained("other", demonstrations=True)
     assert not Path("other").exists()
     scenes.load("shared").save_pretrained("other")

@@ -89,9 +89,9 @@ def adapted(form: Form, config: Mapping[str, Any], demonstrations: Demonstration
     if isinstance(module, InversionModule):
         steps = config["data"]["init_args"]["steps"]
         with bar(f"learning {len(module.concepts)} concepts", steps) as advance:
-            module._found = invert(module.model, module.demonstrations, module.settings, steps, lambda loss: advance())
+            module._learned = invert(module.model, module.demonstrations, module.settings, steps, lambda loss: advance())
     else:
-        module._found = module.learned()
+        module._learned = module.learned()
     return module
 
 

@@ -21,7 +21,7 @@ MOST_NAMED = 6  # demonstrations to list individually
 POINTS = 32  # number of even times at which demonstrations are compared
 UNUSUAL = 3.0  # ratio to all other lengths that makes a length unusual
 DISCRETE = 5  # maximum number of distinct values of a discrete column, which may jump
-JUMP, JUMP_ALONE = 3.0, 10.0  # ratio of a jump to the largest other step, in several columns and in one; fourfold for few steps
+JUMP, JUMP_ALONE = 3.0, 10.0  # ratio of a jump to the largest other step, in several columns or a single; times 4 for few steps
 WRAPPED = 0.8  # share of a column's range that a step covers where an angle wraps
 STILL = 1e-3  # maximum step that counts as standing still, as a share of the usual step
 FEW = 3  # minimum steps of a still stretch, and of the longest demonstration, for a fault
@@ -111,18 +111,18 @@ def read_mended(path: str) -> tuple[Demonstrations, tuple[Finding, ...]]:
 
 
 def check(demonstrations: Demonstrations) -> tuple[Finding, ...]:
-    """Check demonstrations as those of a single concept, whatever their texts; errors and warnings come first.
+    """Check demonstrations as examples of a single concept, ignoring their texts; notes are last.
 
-    Later comparisons exclude demonstrations with a fault.
+    A demonstration with a finding is excluded from later checks.
     """
     few = Finding("three to five demonstrations are usual; fewer do not show which of them is odd", "note")
     findings = [*([few] if len(demonstrations) < 3 else []), *_constant(demonstrations)]
-    left = list(range(len(demonstrations)))
+    remaining = list(range(len(demonstrations)))
     for look in (_lengths, _stills, _units, _duplicates, _jumps, _outliers):
-        reported = [finding.among(left) for finding in look(demonstrations.rows(left))]
+        reported = [finding.among(remaining) for finding in look(demonstrations.rows(remaining))]
         findings += reported
         faulty = {row for finding in reported for row in (finding.rows[1:] if look is _duplicates else finding.rows)}
-        left = [row for row in left if row not in faulty] or left
+        remaining = [row for row in remaining if row not in faulty] or remaining
     return tuple(sorted(findings, key=lambda finding: finding.severity == "note"))
 
 
@@ -189,22 +189,22 @@ def _constant(demonstrations: Demonstrations) -> Iterator[Finding]:
 
 def _duplicates(demonstrations: Demonstrations) -> Iterator[Finding]:
     """Find copies by states and observed features."""
-    paths, apart = _paths(demonstrations), distances(demonstrations)
-    usual = float(_pairs(apart).median()) if len(paths) > 2 else 1.0
+    paths, gaps = _paths(demonstrations), distances(demonstrations)
+    usual = float(_pairs(gaps).median()) if len(paths) > 2 else 1.0
     for values in demonstrations.observed.values():
         flat = values.double().flatten(1)
         differ = (flat[:, None] - flat).abs() > ALIKE * flat.std(dim=0, correction=0)
-        apart = apart.masked_fill(differ.any(dim=2), torch.inf)
+        gaps = gaps.masked_fill(differ.any(dim=2), torch.inf)
     size = min(len(path) for path in paths) * paths[0].shape[1]
     limit = max(ALIKE * usual if size >= ENOUGH else 0.0, SAME)
-    left = list(range(len(paths)))
-    while left:
-        first, *rest = left
-        copies = [row for row in rest if apart[first, row] <= limit]
+    remaining = list(range(len(paths)))
+    while remaining:
+        first, *rest = remaining
+        copies = [row for row in rest if gaps[first, row] <= limit]
         if copies:
             exact = all(torch.equal(paths[first], paths[row]) for row in copies)
-            yield Finding("are the same" if exact else "are nearly the same; they count as one", rows=(first, *copies))
-        left = [row for row in rest if row not in copies]
+            yield Finding("are the same" if exact else "are nearly the same; they count once", rows=(first, *copies))
+        remaining = [row for row in rest if row not in copies]
 
 
 def _stills(demonstrations: Demonstrations) -> Iterator[Finding]:
@@ -283,7 +283,7 @@ def _wraps(states: Tensor, steps: list[Tensor]) -> bool:
 
 
 def _units(demonstrations: Demonstrations) -> Iterator[Finding]:
-    """Find demonstrations whose values are many times the others', or a small part of them."""
+    """Find demonstrations whose values are much larger or smaller than the others'."""
     paths = _paths(demonstrations)
     sizes = torch.stack([path.abs().amax(dim=0) for path in paths])
     varies = torch.cat(paths).std(dim=0, correction=0) > SAME * sizes.amax(dim=0)
@@ -321,14 +321,14 @@ def _outliers(demonstrations: Demonstrations) -> Iterator[Finding]:
 
 
 def _far(points: Tensor, row: int) -> tuple[float, float]:
-    """Distance of a demonstration from the others: its median over theirs, and its minimum over their maximum.
+    """Distance of a demonstration from the others relative to distances among them: ratio of medians, and minimum over maximum.
 
-    Columns are scaled by the others' spread, lest an outlier hides itself.
+    Columns are scaled by the spread of the others, so that an outlier does not inflate it.
     """
     others = _others(range(len(points)), row)
     all_spread, spread = (part.flatten(0, 1).std(dim=0, correction=0) for part in (points, points[others]))
     scale = torch.maximum(spread, 0.1 * all_spread)
-    apart = _apart(points / torch.where(scale > SAME, scale, 1))
-    gaps, among = apart[row, others], _pairs(apart[others][:, others])
+    separations = _apart(points / torch.where(scale > SAME, scale, 1))
+    gaps, among = separations[row, others], _pairs(separations[others][:, others])
     closest = CLOSEST.get(len(points), 0.1)
     return float(gaps.median() / among.median().clamp(min=closest)), float(gaps.min() / among.max().clamp(min=closest))

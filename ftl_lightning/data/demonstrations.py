@@ -1,4 +1,4 @@
-"""Demonstrations of one or several tasks, and the registry of formats that hold them."""
+"""Demonstrations of tasks, and the registry of their file formats."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -41,7 +41,7 @@ class Format:
 
     Attributes:
         read: reads a file, or a data set by its folder or name.
-        write: writes demonstrations under a name, whole or not at all.
+        write: writes demonstrations under a name, atomically.
     """
 
     read: Callable[[str], Contents]
@@ -65,7 +65,7 @@ def _format(kind: str, name: str) -> Format:
 
 @dataclass(frozen=True, repr=False)
 class Demonstrations(Shown):
-    """Demonstrations of one or several tasks, in the domain's units.
+    """Demonstrations of tasks, in the domain's units.
 
     Attributes:
         states: ``(demo, time, state)`` float32, padded beyond each demonstration's length.
@@ -233,11 +233,11 @@ class Demonstrations(Shown):
         return bytes_hash(serialise(KIND, self.tensors, {}))
 
     def save(self, path: str | Path) -> None:
-        """Write the demonstrations, whole or not at all.
+        """Write the demonstrations atomically.
 
         Args:
             path: a safetensors file, with compressed images (zlib); an ``.npz`` file, by its suffix; ``'minari:NAME'`` for a Minari
-                data set; or ``'lerobot:FOLDER'`` for a LeRobot data set. No format keeps padding, and ``.npz`` no provenance.
+                data set; or ``'lerobot:FOLDER'`` for a LeRobot data set. Padding is dropped, in ``.npz`` also provenance.
 
         Raises:
             UserError: naming the path, if it cannot be written or needs an extra that is not installed.

@@ -43,11 +43,11 @@ def warped_distances(states: Tensor, lengths: Tensor, others: Tensor, other_leng
     total = []
     for path, length in zip(states, lengths.tolist(), strict=True):
         cost = torch.cdist(path[None, :length].expand(len(others), -1, -1), others)  # (m, length, other time)
-        far = torch.full((len(others),), math.inf)
+        infinite = torch.full((len(others),), math.inf)
         before = torch.full((len(others), cost.shape[2] + 1), math.inf)
         before[:, 0] = 0
         for row in cost.unbind(dim=1):
-            here = [far]
+            here = [infinite]
             for column in range(cost.shape[2]):
                 here.append(row[:, column] + torch.minimum(torch.minimum(before[:, column], before[:, column + 1]), here[-1]))
             before = torch.stack(here, dim=1)

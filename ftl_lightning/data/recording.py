@@ -56,10 +56,10 @@ def feature_parts(
         UserError: for a key without such a part.
     """
     parts = space.spaces if isinstance(space, gymnasium.spaces.Dict) else {}
-    known = [key for key, box in parts.items() if _is_vector(box) or (images and isinstance(box, Box))]
+    vectors = [key for key, box in parts.items() if _is_vector(box) or (images and isinstance(box, Box))]
     for key in observed or ():
-        require(key in known, "observed", f"some of {', '.join(known) or 'none'}", f"{short(key)!r}")
-    return tuple(key for key in known if key != states) if observed is None else tuple(observed)
+        require(key in vectors, "observed", f"some of {', '.join(vectors) or 'none'}", f"{short(key)!r}")
+    return tuple(key for key in vectors if key != states) if observed is None else tuple(observed)
 
 
 def _is_vector(space: gymnasium.Space[Any]) -> bool:

@@ -59,14 +59,14 @@ class ClosedLoop:
             actions (episode, action)``.
         steps: maximum number of steps in an episode.
         judge: ``(goal, rollout) -> outcomes`` by name, each ``(episode,)``. ``'success'``, of bool, is required.
-        film: ``(rollout of one episode, plans (step, horizon, state) that were followed) -> frames``; ``None`` for no film.
-        vector_film: ``rollout of one episode -> film`` of moving shapes for ``report --html``; ``None`` for no film.
+        film: ``(rollout of an episode, plans (step, horizon, state) that were followed) -> frames``; ``None`` for no film.
+        vector_film: ``rollout of an episode -> film`` of moving shapes for ``report --html``; ``None`` for no film.
         keeps: names of the observed features that ``judge`` and films need; empty for all.
         less_is_better: names of the outcomes of which a smaller value is better, such as ``'crash'``.
         identity: description of what outcomes depend on besides the code, such as the planner's name; may be empty. It is part of
             the configuration's hash.
-        others: alternative environments by name, such as one with another planner. ``evaluation.environments`` selects those in
-            which plans are also executed.
+        others: alternative environments by name, such as an environment with another planner. ``evaluation.environments`` selects
+            those in which plans are also executed.
         policies: reference policies that act step by step, by name: ``(goal, initial states, demonstrations of the concept or None,
             seed) -> policy``, or ``None`` if it would take too long.
         expect: check that raises a :class:`~ftl_lightning.services.errors.UserError` if the environment lacks a package; called

@@ -53,8 +53,8 @@ class FileSource:
 
     def split(self, name: Split, count: int, seed: int) -> Demonstrations:
         """All demonstrations of a split; ``count`` and ``seed`` are ignored."""
-        wanted = self.held_out if name == "validation" else ~self.held_out
-        return self.demonstrations.rows(wanted.nonzero()[:, 0].tolist())
+        rows = self.held_out if name == "validation" else ~self.held_out
+        return self.demonstrations.rows(rows.nonzero()[:, 0].tolist())
 
     def draw(self, task: str, count: int, seed: int, workers: int = 1) -> Demonstrations:
         """The first ``count`` demonstrations of a concept; raises a ``UserError`` if there are fewer."""
@@ -66,8 +66,8 @@ class FileSource:
         """Initial states of held-out demonstrations, drawn with replacement."""
         if not self.demonstrations.observed:
             return None
-        known = self.split("validation", count, seed).initial_states
-        return known.take(torch.randint(len(known), (count,), generator=generator("cpu", seed)))
+        starts = self.split("validation", count, seed).initial_states
+        return starts.take(torch.randint(len(starts), (count,), generator=generator("cpu", seed)))
 
 
 def own_domain(
@@ -76,10 +76,10 @@ def own_domain(
     """Domain of user data.
 
     Args:
-        examples: demonstrations that plans are compared with, at least one of each evaluated concept.
+        examples: demonstrations of all evaluated concepts, which plans are compared with.
         training: training concepts.
         horizon: states in a plan.
-        metrics: names and numbers, see this module; an unknown one raises a ``UserError``.
+        metrics: names and numbers, see this module; an unknown name raises a ``UserError``.
         source: source of demonstrations; ``None`` for the examples.
     """
     unknown = sorted(set(metrics) - set(METRICS))
@@ -104,7 +104,7 @@ def domain_from_file(path: str, horizon: int | None, metrics: Mapping[str, float
         path: the file, the folder of a LeRobot data set, or the name of an installed Minari data set.
         horizon: states in a plan; ``None`` for the length of the longest demonstration.
         metrics: see :func:`own_domain`.
-        share: share of each concept's demonstrations to hold out, at least one.
+        share: share of each concept's demonstrations to hold out, at least a single demonstration.
 
     Raises:
         UserError: naming the file, if it has no texts, fewer than two concepts, or a concept with a single demonstration.
@@ -139,10 +139,10 @@ def read_demonstrations(path: str, domain: Domain) -> Demonstrations:
         UserError: naming the file, if it does not fit the domain.
     """
     demonstrations = read_own(path)
-    columns, found = len(domain.plans.columns), tuple(demonstrations.states.shape)
-    known = demonstrations.domain in ("", domain.name)
-    require(known, f"{path}: key 'domain'", repr(domain.name), repr(short(demonstrations.domain)))
-    require(found[2] == columns, f"{path}: key 'states'", f"shape (demo, time, {columns})", str(found))
+    columns, shape = len(domain.plans.columns), tuple(demonstrations.states.shape)
+    fits = demonstrations.domain in ("", domain.name)
+    require(fits, f"{path}: key 'domain'", repr(domain.name), repr(short(demonstrations.domain)))
+    require(shape[2] == columns, f"{path}: key 'states'", f"shape (demo, time, {columns})", str(shape))
     with about(path):
         return demonstrations.fitted(domain.observed)
 
@@ -177,11 +177,11 @@ def _distance(examples: Demonstrations, states: Tensor, others: Tensor) -> Tenso
 
 def _recognised(examples: Demonstrations, horizon: int, number: float) -> Metric:
     require(0 < number <= 1, "data.metrics.recognised", "a share of real demonstrations above 0, at most 1", f"{number:g}")
-    known = cache(lambda: Recognition(examples, horizon, number))  # fitted on first use
+    recognition = cache(lambda: Recognition(examples, horizon, number))  # fitted on first use
 
     def measure(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
         _goal_rows(examples, goal)
-        return known().recognised(goal, states)
+        return recognition().recognised(goal, states)
 
     return Metric(measure, identity=examples.hash)
 

@@ -1,14 +1,14 @@
-"""Recognition by examples: whether a plan belongs to a concept and is as typical of it as real behaviour.
+"""Recognition by examples: whether a plan belongs to a concept and is as typical as real behaviour.
 
 Features of a plan, after columns are scaled alike: place (mean over time of each column), size (root mean square about the place),
 shape (the normalised rest, as coefficients of the discrete cosine transform) and roughness (mean squared second difference). A
 single state has only a size and a shape, its columns.
 
 A concept is a Gaussian over place, size and shape (regularised discriminant analysis; Friedman, 1989). Its variances are pooled
-over concepts and move towards the concept's variances as its examples increase; directions in which its examples vary enter its
-covariance. A plan belongs to the likeliest concept. The largest distance of real behaviour from its concept is estimated by
-leave-one-out, with as many examples as the concept has. Only excess roughness counts. If no concept has two examples, only the
-likeliest concept and the roughness decide.
+over concepts, and shrink less towards the pooled variances the more examples the concept has; its covariance includes the
+directions in which its examples vary. A plan belongs to the likeliest concept. The largest distance of real behaviour from its
+concept is estimated by leave-one-out, with as many examples as the concept has. Only excess roughness counts. If no concept has two
+examples, only the likeliest concept and the roughness decide.
 """
 
 import math
@@ -38,7 +38,7 @@ RESTING = 0.25
 ENDS, LEFT_OUT = 8, 200
 """Maximum number of candidate lengths of a plan, and of examples for leave-one-out."""
 FEW = 1.0
-"""Relative increase of limits, divided by the number of concepts in leave-one-out: few concepts give uncertain limits."""
+"""Relative increase of limits times the number of concepts in leave-one-out: limits from few concepts are uncertain."""
 ROUGHER = 2.0
 """Limit of the roughness relative to the example's (root mean square) if no concept has two examples."""
 
@@ -81,8 +81,8 @@ class _Within:
 class _Concept:
     """Gaussian model of a concept.
 
-    Precision of shapes is ``precision``, its diagonal, and a low-rank part ``loadings``, ``inverse`` (Woodbury's identity).
-    ``volume`` is the log-determinant for known means: otherwise concepts with many examples would be favoured.
+    The precision of shapes is the diagonal ``precision`` minus a low-rank part of ``loadings`` and ``inverse`` (Woodbury's
+    identity). ``volume`` is the log-determinant without the means' uncertainty, which would favour concepts with many examples.
     """
 
     position: Tensor
@@ -115,33 +115,33 @@ class _Concept:
         return cls(mean[0], variance * wider, mean[1], 1 / (diagonal * wider), scaled, inverse, float(volume), mean[2])
 
     def distances(self, features: _Features, resting: float) -> tuple[Tensor, Tensor]:
-        """Distances of ``n`` plans from the concept.
+        """Mahalanobis distances of ``n`` plans from the concept.
 
         Returns:
-            -2 log-likelihood ``(n,)`` up to a constant, and deviations ``(n, 5)`` in place, size, shape, roughness and rest, each
-            about 1 for typical behaviour.
+            -2 log-likelihood ``(n,)`` up to a constant, and deviations ``(n, 5)`` of place, size, shape, roughness and rest, each
+            in standard deviations: about 1 for typical behaviour.
         """
-        far = (features.position - self.position) ** 2 / self.variance
-        apart = features.shape - self.shape
-        along = apart @ self.loadings.T
-        square = (apart**2 * self.precision).sum(dim=1) - torch.einsum("nk,kl,nl->n", along, self.inverse, along)
-        square = square.clamp(min=0)
+        position = (features.position - self.position) ** 2 / self.variance
+        difference = features.shape - self.shape
+        along = difference @ self.loadings.T
+        shape = (difference**2 * self.precision).sum(dim=1) - torch.einsum("nk,kl,nl->n", along, self.inverse, along)
+        shape = shape.clamp(min=0)
         rough = ((features.roughness + ROUGHNESS) / (self.roughness + ROUGHNESS)).mean(dim=1)
-        measured = (
-            far[:, :-1].mean(dim=1) if far.shape[1] > 1 else torch.zeros_like(square),
-            far[:, -1],
-            square / apart.shape[1],
-            rough if self.roughness.numel() else torch.ones_like(square),
+        squares = (
+            position[:, :-1].mean(dim=1) if position.shape[1] > 1 else torch.zeros_like(shape),
+            position[:, -1],
+            shape / difference.shape[1],
+            rough if self.roughness.numel() else torch.ones_like(shape),
             (features.rest / resting) ** 2,
         )
-        return far.sum(dim=1) + square + self.volume, torch.stack(measured, dim=1).sqrt()
+        return position.sum(dim=1) + shape + self.volume, torch.stack(squares, dim=1).sqrt()
 
 
 class Recognition:
     """Classifier of plans, fitted to examples of concepts.
 
     Args:
-        examples: one or more per concept. If their lengths differ, a plan may end at one of these lengths and then rests.
+        examples: at least one per concept. If their lengths differ, a plan may end at any of these lengths and then rests.
         horizon: states in a plan.
         share: share of real behaviour to accept as typical, in (0, 1].
     """
@@ -170,15 +170,13 @@ class Recognition:
         self._limits = cache(self._left_out)
 
     def recognised(self, goal: str, states: Tensor) -> Tensor:
-        """Whether a goal is the likeliest concept of finite plans ``(sample, time, state)`` and they are typical of it
-        ``(sample,)``.
-        """
+        """Whether plans ``(sample, time, state)`` are finite, likeliest under and typical of a goal's concept: ``(sample,)``."""
         finite = states.isfinite().flatten(1).all(dim=1)
         ending = self._ending(self._fitted(torch.where(finite[:, None, None], states, 0)))
-        unlikely, far = _nearest_end(self.concepts[goal], ending, self.resting)
+        score, deviation = _nearest_end(self.concepts[goal], ending, self.resting)
         others = [_nearest_end(concept, ending, self.resting)[0] for name, concept in self.concepts.items() if name != goal]
-        likeliest = torch.stack([unlikely, *others]).argmin(dim=0) == 0
-        typical = (far <= self._limits(len(self.rows[goal]))).all(dim=1)
+        likeliest = torch.stack([score, *others]).argmin(dim=0) == 0
+        typical = (deviation <= self._limits(len(self.rows[goal]))).all(dim=1)
         return finite & likeliest & typical
 
     def _left_out(self, count: int) -> Tensor:
@@ -195,9 +193,9 @@ class Recognition:
             within = self.total.plus(self.within[concept], -1).plus(_Within.of(self.known.rows(rest)))
             fitted = _Concept.of(self.known.rows(chosen), within if within.freedom else self.total)
             deviations.append(_nearest_end(fitted, [ending.rows([row]) for ending in self.presented], self.resting)[1])
-        far = torch.cat(deviations)
-        limits = far.quantile(self.share, dim=0).clamp(min=1)
-        together = (far / limits).amax(dim=1).quantile(self.share)  # joint limit of all five
+        all_deviations = torch.cat(deviations)
+        limits = all_deviations.quantile(self.share, dim=0).clamp(min=1)
+        together = (all_deviations / limits).amax(dim=1).quantile(self.share)  # joint limit of all five
         return (limits * together * (1 + FEW / len({concept for concept, _ in pairs}))).clamp(min=1)
 
     def _fitted(self, states: Tensor) -> Tensor:
@@ -257,8 +255,8 @@ def _stretched(states: Tensor, lengths: Tensor) -> Tensor:
 def _nearest_end(concept: _Concept, ending: Sequence[_Features], resting: float) -> tuple[Tensor, Tensor]:
     """Results of :meth:`_Concept.distances` at the likeliest end."""
     distances = [concept.distances(features, resting) for features in ending]
-    unlikely = torch.stack([score for score, _ in distances])  # (end, n)
-    far = torch.stack([deviation for _, deviation in distances])
-    best = (unlikely + torch.where(far[..., -1] > 1, 1e30, 0)).argmin(dim=0)
-    index = torch.arange(unlikely.shape[1])
-    return unlikely[best, index], far[best, index]
+    scores = torch.stack([score for score, _ in distances])  # (end, n)
+    deviations = torch.stack([deviation for _, deviation in distances])
+    best = (scores + torch.where(deviations[..., -1] > 1, 1e30, 0)).argmin(dim=0)
+    index = torch.arange(scores.shape[1])
+    return scores[best, index], deviations[best, index]

@@ -96,9 +96,9 @@ def check_path(scene: Scene, path: Any, seconds: Any) -> tuple[Numbers, Numbers]
     require(np.isfinite(places).all() and np.isfinite(times).all(), "path and seconds", "finite numbers", "others")
     require((np.diff(times) >= 0).all(), "seconds", "times that never go back", "some that do")
     left, lower, width, height = scene.film.window
-    away = np.abs((places - (left + width / 2, lower + height / 2)) / (width, height)).max()
-    found = f"one {away:.3g} times its size from its middle"
-    require(away <= 0.5 + AROUND, "path", "places near what is in sight", found)
+    distance = np.abs((places - (left + width / 2, lower + height / 2)) / (width, height)).max()
+    far_away = f"one {distance:.3g} times its size from its middle"
+    require(distance <= 0.5 + AROUND, "path", "places near what is in sight", far_away)
     return places, times
 
 
@@ -118,9 +118,9 @@ def reached(line: Numbers) -> Numbers:
 
 def at_even_steps(line: Numbers, count: int) -> Numbers:
     """Resample a line to points ``(count, 2)`` at even steps, including its ends; pauses of the hand vanish."""
-    far = reached(line)
-    wanted = np.linspace(0, far[-1], count)
-    return np.stack([np.interp(wanted, far, column) for column in line.T], axis=-1)
+    lengths = reached(line)
+    targets = np.linspace(0, lengths[-1], count)
+    return np.stack([np.interp(targets, lengths, column) for column in line.T], axis=-1)
 
 
 def smoothed(line: Numbers, blur: float) -> Numbers:

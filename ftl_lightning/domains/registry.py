@@ -70,7 +70,7 @@ def domain_of_file(name: str) -> Domain:
 
 
 def recorded_name(name: str) -> str:
-    """Name of a domain in files, by which models find it: its entry-point name if it has one, else the given name.
+    """Name of a domain in files, by which models find it: its entry-point name if registered, else the given name.
 
     Raises:
         UserError: see :func:`load_domain`.

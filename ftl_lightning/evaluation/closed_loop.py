@@ -86,8 +86,8 @@ def _lock_step(loop: ClosedLoop, rows: range, rollout: Rollout, policy: Policy, 
             value = observation.get(name) if isinstance(observation, Mapping) else None
             shape, place = tuple(values.shape[1:]), row - rows.start
             if value is None or np.shape(value) != shape:
-                found = "none" if value is None else np.shape(value)
-                raise UserError(f"environment: expected it to observe {name!r} {shape}, found {found}")
+                actual = "none" if value is None else np.shape(value)
+                raise UserError(f"environment: expected it to observe {name!r} {shape}, found {actual}")
             values[place] = torch.as_tensor(value)
             if name in rollout.observed:
                 rollout.observed[name][row, step:] = values[place]
@@ -175,7 +175,7 @@ def sampled_plans(
 
 
 def planner(model: ConceptModel, loop: ClosedLoop) -> Planner:
-    """The planner of the model's view, if it has one, else the domain's."""
+    """Planner of the model's view, else of the domain."""
     return model.view.act if model.view is not None and model.view.act is not None else loop.act
 
 

@@ -72,7 +72,7 @@ class Evaluator(pl.Callback):
             return self.suites
         if not isinstance(data, InversionData):
             return ("training",)
-        return () if data.own else ("training", "paper")
+        return () if data.of_user else ("training", "paper")
 
     def settings(self, data: pl.LightningDataModule) -> dict[str, Any]:
         """Evaluation settings by name."""
@@ -151,7 +151,7 @@ class Evaluator(pl.Callback):
     def _compare(self, domain: Domain, data: PretrainingData | InversionData) -> Mapping[str, Sequence[TaskResult]]:
         """Measure novelty and coverage, and return the reference lines by name."""
         seed, environments = self.generation.seed, self.generation.environments
-        compared = self.references if self.references is not None else not getattr(data, "own", False)
+        compared = self.references if self.references is not None else not getattr(data, "of_user", False)
         reference_lines = references(self.judged, domain, seed, environments) if compared else {}
         if self.diversity:
             real = real_behaviour(self.judged, domain, data.root, seed)

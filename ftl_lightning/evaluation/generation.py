@@ -169,7 +169,8 @@ def standard_error(values: Sequence[float]) -> float:
 
 
 def paired(generated: TaskResult, reference: TaskResult, policy: str, domain: Domain) -> dict[str, Tensor]:
-    """Compare a method with a policy from the same initial states: episodes ``(sample,)`` in which only one of the two succeeds.
+    """Compare a method with a policy from the same initial states: episodes ``(sample,)`` in which only the method, or only the
+    policy, succeeds.
 
     The domain's headline metric defines success if it is an outcome.
 

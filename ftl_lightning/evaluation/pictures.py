@@ -40,8 +40,8 @@ MILLIMETRES = 1000  # per metre; 3D coordinates are integers in millimetres
 
 def frame_milliseconds(count: int, seconds: float | None = None) -> int:
     """Duration of each of ``count`` frames, in the format's steps of 10 ms; without a total near :data:`SECONDS` in all."""
-    each = float(np.clip(SECONDS / count, *FRAME_SECONDS)) if seconds is None else seconds / count
-    return max(10 * round(100 * each), 20)
+    duration = float(np.clip(SECONDS / count, *FRAME_SECONDS)) if seconds is None else seconds / count
+    return max(10 * round(100 * duration), 20)
 
 
 def gif(pictures: Sequence[NDArray[np.uint8]], seconds: float | None = None, colours: int = COLOURS) -> bytes:
@@ -52,8 +52,8 @@ def gif(pictures: Sequence[NDArray[np.uint8]], seconds: float | None = None, col
         colours: number of colours per picture, up to 256.
     """
     first, *rest = (Image.fromarray(picture).quantize(colours) for picture in pictures)
-    each = frame_milliseconds(len(pictures), seconds)
-    durations = [*[each] * len(rest), each + 10 * round(100 * END_SECONDS)]
+    duration = frame_milliseconds(len(pictures), seconds)
+    durations = [*[duration] * len(rest), duration + 10 * round(100 * END_SECONDS)]
     content = io.BytesIO()
     first.save(content, "GIF", save_all=True, append_images=rest, duration=durations, loop=0)
     return content.getvalue()

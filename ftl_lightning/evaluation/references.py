@@ -48,7 +48,7 @@ _CACHE: dict[Hashable, Any] = {}
 
 
 def _cached(key: Hashable, compute: Callable[[], T]) -> T:
-    """Value from the cache; the oldest value makes room for a new one."""
+    """Value from the cache, which drops its oldest value when full."""
     if key not in _CACHE:
         if len(_CACHE) >= KEPT:
             del _CACHE[next(iter(_CACHE))]
@@ -130,7 +130,7 @@ class Real:
         domain: domain of the task.
         count: number of generated plans.
         demonstrations: demonstrations of the task's concept; ``None`` if novelty does not apply.
-        fresh: ``count`` samples of the task to cover, and ``count`` more; ``None`` if the domain cannot draw any.
+        fresh: two sets of ``count`` real samples, to cover and as a reference line; ``None`` if the domain cannot draw any.
     """
 
     task: EvaluationTask
@@ -144,7 +144,7 @@ class Real:
         """Collect the real behaviour of a task; arguments as in :func:`real_behaviour`.
 
         Novelty applies if the demonstrations show the task itself, not to compositions with training concepts or single components.
-        Nothing is compared for tasks that start in the demonstrations' initial states, where replaying a demonstration is right.
+        Tasks that start in the demonstrations' initial states are not compared: replaying a demonstration solves them.
         """
         task, count, demonstrations = generated.task, len(generated.states), generated.demonstrations
         if task.initial != "new":
@@ -181,16 +181,16 @@ class Real:
         return replace(judged, diversity=self.values(judged.states))
 
     def replayed(self) -> TaskResult | None:
-        """Judge ``count`` plans that repeat the demonstrations in turn; ``None`` without demonstrations."""
+        """Judge the demonstrations, repeated to ``count`` plans; ``None`` without demonstrations."""
         if self.demonstrations is None:
             return None
         turns = torch.arange(self.count) % len(self.demonstrations)
         return self._judged(self.demonstrations.rows(turns.tolist()))
 
     def lines(self) -> dict[str, TaskResult]:
-        """Judge the reference lines, ``count`` replayed demonstrations and fresh samples, by name.
+        """Judge the reference lines by name: ``count`` replayed demonstrations, and as many fresh samples.
 
-        Replayed demonstrations are omitted if only novelty is measured, as their novelty is 0.
+        Replayed demonstrations, whose novelty is 0, are omitted if only novelty is measured.
         """
         judged = {}
         if (self.domain.metrics or self.fresh) and (replayed := self.replayed()) is not None:

@@ -158,8 +158,9 @@ def rows(
         task = behaviour.task
         subject = {"domain": domain.name, "setting": task.setting, "task": task.name, "seed": hparams["seed"]}
         # Reference policies use demonstrations, reference plans do not.
-        given = demonstrations_of(task, module.demonstrated) if source["method"] not in domain.comparison.references else None
-        subject["demonstrations"] = 0 if given is None else len(given)
+        learns = source["method"] not in domain.comparison.references
+        demonstrations = demonstrations_of(task, module.demonstrated) if learns else None
+        subject["demonstrations"] = 0 if demonstrations is None else len(demonstrations)
         for name, value in values.items():
             yield Row(**subject, **source, n=len(behaviour.states), metric=name, value=round(value, 6))
 
@@ -215,8 +216,8 @@ def add_rows(path: str | Path, table: "pd.DataFrame") -> None:
     path = Path(path)
     with alone(path.parent):
         if path.is_file():
-            known = read_rows(path)
-            table = known if table.empty else pd.concat([known, table])
+            existing = read_rows(path)
+            table = existing if table.empty else pd.concat([existing, table])
         with atomic(path) as temporary:
             table.drop_duplicates(_KEY, keep="last").to_csv(temporary, index=False)
 

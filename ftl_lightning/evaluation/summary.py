@@ -59,7 +59,7 @@ def hparams_of(
         data: training or test data.
         settings: settings of the evaluator.
         trainer: trainer.
-        rows: rows of the method, at least one.
+        rows: rows of the method; not empty.
     """
     first = rows[0]
     groups = {"model": public(module.hparams), "data": public(data.hparams), "evaluation": settings}

@@ -21,9 +21,9 @@ from ftl_lightning.training.concept_model import ConceptModel
 
 @dataclass(frozen=True)
 class _Part(Sampling):
-    """Sampling of some of the plans."""
+    """Sampling of some of the plans, with given ``noise``."""
 
-    own: Noise | None = None
+    noise: Noise | None = None
     advance: Callable[[], None] = field(default=lambda: None)
 
     def run(self, epsilon: Epsilon, noise: Noise, alpha_bar: Tensor) -> Tensor:
@@ -32,7 +32,7 @@ class _Part(Sampling):
             self.advance()
             return predicted
 
-        return super().run(predict, self.own or noise, alpha_bar)
+        return super().run(predict, self.noise or noise, alpha_bar)
 
 
 def sampled(
@@ -48,7 +48,7 @@ def sampled(
     """Sample plans of a concept ``(count, horizon, state)``.
 
     Noise and modes are drawn for all plans from the seed, so that plans do not depend on the batch size, up to rounding. Methods
-    without a sampler need one pass of a small network and ignore it.
+    without a sampler generate all plans in a single pass and ignore the batch size.
 
     Args:
         observed: features ``(count, *shape)`` by name, on the model's device.
@@ -79,18 +79,18 @@ def _part(
 ) -> Tensor:
     """Plans ``(n, horizon, state)`` of some ``rows (n,)`` in :func:`sampled`; noise is drawn for all rows and selected."""
     concept, draw = concept.uncomposed, generator("cpu", seed)
-    whole, numbers = concept.draw(count, draw)
+    compositions, numbers = concept.draw(count, draw)
     shape = (count, model.config.horizon, model.config.state_dim)
 
     def noise() -> Tensor:
         return torch.randn(shape, generator=draw)[rows].to(model.device)
 
-    how = _Part(**asdict(sampling), own=noise, advance=advance)
-    seen = take(observed, rows.to(model.device))
+    how = _Part(**asdict(sampling), noise=noise, advance=advance)
+    features = take(observed, rows.to(model.device))
     if concept.modes is None:
-        return model.sample([concept], len(rows), how, [draw], seen)[0]
-    each = [whole.row(number) for number in numbers[rows.to(numbers.device)].tolist()]
-    return model.sample(each, 1, how, [draw] * len(each), seen)[:, 0]
+        return model.sample([concept], len(rows), how, [draw], features)[0]
+    modes = [compositions.row(number) for number in numbers[rows.to(numbers.device)].tolist()]
+    return model.sample(modes, 1, how, [draw] * len(modes), features)[:, 0]
 
 
 def plans_of(domain: Domain, states: Tensor, starts: InitialStates | None, provenance: Mapping[str, Any]) -> Demonstrations:

@@ -27,7 +27,7 @@ class Learning:
     Attributes:
         step: number of completed steps.
         loss: mean loss of the last step.
-        so_far: returns the current concept, of one set of embeddings whatever the final form.
+        so_far: returns the current concept, a single set of embeddings whatever the final form.
     """
 
     step: int
@@ -43,7 +43,7 @@ class LearnedConcept(Composition):
         concept: embeddings, weights and origin.
         model: the concept's model.
         tuned: the model's settings, for sampling its film.
-        known_as: public name of the model: a shipped model or ``'owner/name'`` on the Hub; empty without one.
+        known_as: public name of the model: a shipped model or ``'owner/name'`` on the Hub; empty for none.
         demonstrations: its demonstrations, if it was learned in this process.
         judging: domain that judges its samples, if it was learned in this process.
     """
@@ -131,7 +131,7 @@ class LearnedConcept(Composition):
             UserError: if demonstrations are requested for a concept that was not learned in this process.
         """
         if demonstrations and self.demonstrations is None:
-            raise UserError("demonstrations: expected a concept that was learned here, found one from a file; leave them out")
+            raise UserError("demonstrations: expected a concept that was learned here, found a concept from a file; leave them out")
         shared = self.demonstrations if demonstrations else None
         write_folder(Path(folder), self.model, self._judged, self.tuned, self.known_as, shared)
 

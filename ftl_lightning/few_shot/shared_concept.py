@@ -51,7 +51,7 @@ def write_folder(
     """Write the folder of a concept; an existing card is kept.
 
     Args:
-        known_as: public name of the model; empty without one.
+        known_as: public name of the model; empty for none.
         demonstrations: demonstrations to include; ``None`` for none.
     """
     concept.save(folder / CONCEPT)
@@ -96,13 +96,13 @@ def card(path: Path, known_as: str, shown: str, with_demonstrations: bool) -> st
     """Card with the Hub's metadata; ``UserError`` for a file that is not a concept.
 
     Args:
-        known_as: public name of the model; empty without one.
+        known_as: public name of the model; empty for none.
         shown: file name of the film or picture; empty for none.
         with_demonstrations: whether the folder includes demonstrations.
     """
     content = summary(path)
     if content is None:
-        raise UserError(f"{path}: expected a concept file, found another one")
+        raise UserError(f"{path}: expected a concept file, found another file")
     origin, quality, model = content.origin, content.quality, known_as or "FOLDER OR NAME OF THE MODEL"
     keys = {"concept": origin.name, **({"model": known_as} if known_as else {}), "hash": origin.pretrained, "domain": origin.domain}
     # JSON strings are valid YAML; ``line`` has replaced unprintable characters, which YAML refuses.
@@ -177,8 +177,8 @@ def _frames(
 def _plans(
     model: ConceptModel, concept: Composition, tuned: ModelSettings, starts: InitialStates | None, count: int
 ) -> torch.Tensor:
-    seen = {} if starts is None else moved(starts.take(slice(0, count)).observed, model.device)
-    return model.sample([concept], count, tuned.sampling, [generator("cpu", 0)], seen)[0].cpu()
+    features = {} if starts is None else moved(starts.take(slice(0, count)).observed, model.device)
+    return model.sample([concept], count, tuned.sampling, [generator("cpu", 0)], features)[0].cpu()
 
 
 def _starts(domain: Domain, name: str, count: int) -> InitialStates | None:

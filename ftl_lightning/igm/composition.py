@@ -106,7 +106,7 @@ class Composition(Shown):
             )
         other = other if other.weights.device == self.weights.device else other.to(self.weights.device)
         if all(any(adapter.everywhere for adapter in part.adapters) for part in (self, other)):
-            raise UserError("compose: expected at most one concept whose adapter changes the whole network, found two")
+            raise UserError("compose: expected at most 1 concept whose adapter changes the whole network, found 2")
         parts, adapters = (self, other), (*self.adapters, *other.adapters)
         knots, state = _common([part.knots for part in parts]), _columns_of(parts)
         after = torch.where(other.adapter_number > 0, other.adapter_number + len(self.adapters), 0)
@@ -199,7 +199,7 @@ class Composition(Shown):
         )
 
     def drawn(self, generator: torch.Generator) -> "Composition":
-        """Composition ``(K, ...)`` of a single sample, without modes; the generator draws one of several modes."""
+        """Composition ``(K, ...)`` of a single sample, without modes; the generator draws the mode."""
         if self.uncomposed.modes is None:
             return self.uncomposed
         rows, row = self.uncomposed.draw(1, generator)
@@ -221,7 +221,7 @@ def _summed_modes(first: Composition, second: Composition) -> Modes | None:
 def _common(knots: Sequence[int]) -> int:
     """Common number of knots of composed concepts."""
     if len(several := sorted(set(knots) - {1})) > 1:
-        raise UserError(f"compose: expected concepts of one number of knots (or of one knot), found {several[0]} and {several[1]}")
+        raise UserError(f"compose: expected concepts with equal numbers of knots (or 1 knot), found {several[0]} and {several[1]}")
     return max(knots, default=1)
 
 

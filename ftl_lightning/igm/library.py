@@ -88,7 +88,7 @@ class Entry:
         model: hash of the model.
         count: number of demonstrations; ``None`` for a training concept.
         form: form, such as ``'one set'`` or ``'adapter'``; empty for a training concept.
-        accuracy: share of right samples, 0 to 1, if recorded.
+        accuracy: share of correct samples, 0 to 1, if recorded.
         metric: the accuracy's domain metric; empty without an accuracy.
         path: file; ``None`` for a training concept.
     """
@@ -119,7 +119,7 @@ class Entry:
 
 @dataclass(frozen=True, repr=False)
 class Library(Shown):
-    """Concepts of one model.
+    """Concepts of a model.
 
     Attributes:
         entries: training concepts, then shipped, then saved concepts.
@@ -209,13 +209,13 @@ def _name_in(path: Path) -> str:
     return "" if content is None else content.origin.name
 
 
-def library(model: str, training: Sequence[str], own: Path | None = None, folders: Iterable[str | Path] = ()) -> Library:
+def library(model: str, training: Sequence[str], shipped: Path | None = None, folders: Iterable[str | Path] = ()) -> Library:
     """Library of a model's concepts; ``UserError`` for an entry of ``folders`` that is not a folder.
 
     Args:
         model: hash of the model.
         training: texts of the training concepts.
-        own: the model's folder, with shipped concepts ``*.safetensors``; ``None`` without a folder.
+        shipped: the model's folder, with shipped concepts ``*.safetensors``; ``None`` without a folder.
         folders: folders of saved concepts ``*.safetensors``, directly or in subfolders; :func:`concepts_folder` is always
             searched.
     """
@@ -224,15 +224,15 @@ def library(model: str, training: Sequence[str], own: Path | None = None, folder
         if not place.is_dir():
             actual = "a file" if place.exists() else "nothing"
             raise UserError(f"folder: expected a folder of learned concepts, found {actual} at {short(str(place), 150)}")
-    files: list[tuple[Kind, Path]] = [("shipped", path) for path in visible(own, "*.safetensors")] if own is not None else []
+    files: list[tuple[Kind, Path]] = [] if shipped is None else [("shipped", path) for path in visible(shipped, "*.safetensors")]
     for place in (*places, concepts_folder()):
         files += [("saved", path) for pattern in ("*.safetensors", "*/*.safetensors") for path in visible(place, pattern)]
     entries, others, damaged = [Entry(text, "training", model) for text in training], 0, []
-    seen: set[str] = set()
+    paths_read: set[str] = set()
     for kind, path in files:
-        if (real := os.path.realpath(path)) in seen:
+        if (real := os.path.realpath(path)) in paths_read:
             continue
-        seen.add(real)
+        paths_read.add(real)
         try:
             content = summary(path)
         except (UserError, OSError) as error:

@@ -10,7 +10,7 @@ from ftl_lightning.services.errors import require
 from ftl_lightning.services.validation import LARGEST, LARGEST_RATE, MOST_TOGETHER, check_count, check_factor, check_range, replaced
 
 EXPLAINED = 0.4
-"""Minimum gain of one set of embeddings, as a share of the modes' gain, to use mixtures; chosen on validation suites."""
+"""Minimum gain of a single set of embeddings, as a share of the modes' gain, to use mixtures; chosen on validation suites."""
 MOST = 1000
 """Maximum number of components, knots and restarts, and maximum rank of an adapter."""
 
@@ -18,7 +18,7 @@ UNSAID, PAPER, AUTO = "", "paper", "auto"
 """Rules for a concept's form: by the source of demonstrations, see :meth:`InversionSettings.for_own`; by the other options (the
 paper's form by default); selected by leave-one-out error."""
 ONE, MODES, ADAPTED, MIXED = "one set", "modes", "adapter", "mixtures"
-"""Forms: one set of embeddings; a set for each demonstration, drawn at random; one set and a low-rank adapter of the denoiser; a
+"""Forms: a set of embeddings; a set for each demonstration, drawn at random; a set and a low-rank adapter of the denoiser; a
 set for each demonstration and a shared adapter, with samples from mixtures."""
 MEAN, CONCEPTS = STARTS = "mean", "concepts"
 """Initial embeddings."""
@@ -111,8 +111,8 @@ class ModeOptions:
 
     Attributes:
         sets: 1 is the paper's form; otherwise a set is also learned, from the same start, for every demonstration (``'each'``), or
-            from every n-th demonstration for n sets. ``'auto'`` is ``'each'``, with samples from mixtures of the modes if one set
-            has at least :data:`EXPLAINED` of the modes' gain, and from single modes otherwise.
+            from every n-th demonstration for n sets. ``'auto'`` is ``'each'``, with samples from mixtures of the modes if a single
+            set has at least :data:`EXPLAINED` of the modes' gain, and from single modes otherwise.
         samples: noised demonstrations a step for a mode.
     """
 

@@ -23,9 +23,9 @@ Context = tuple[Tensor, ...]
 CHOSEN = 4
 """Number of image points that a concept chooses."""
 SHARPNESS = 4.0
-"""Inverse temperature of a choice; a mean of several points is the position of none."""
+"""Softmax inverse temperature of a choice: high, since the mean of several points is the position of none of them."""
 SMALLEST = 0.02
-"""Length of a vector below which its direction is scaled down."""
+"""Vector length below which the direction feature shrinks towards 0."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ def sinusoidal_embedding(t: Tensor, dimension: int, period: float = 10_000.0) ->
 
 
 class ConditionEncoder(nn.Module, ABC):
-    """Base class of condition encoders, which are constructed with the domain's :class:`Sizes` and their number of features."""
+    """Base class of condition encoders, constructed with the domain's :class:`Sizes` and the number of output features."""
 
     @abstractmethod
     def observe(self, vector: Tensor) -> Context:
@@ -137,16 +137,16 @@ class JointEncoder(ConditionEncoder):
 
 
 class _Entities(ConditionEncoder):
-    """Base class of encoders of exchangeable entities. Columns of no entity are appended to every entity and to the features."""
+    """Base class of encoders of exchangeable entities. Shared columns are appended to every entity and to the features."""
 
-    columns: Tensor  # of each entity (entity, column)
+    columns: Tensor  # columns of each entity (entity, column)
     shared: Tensor  # columns that belong to no entity
     entity: nn.Sequential
 
     def __init__(self, name: str, sizes: Sizes) -> None:
         super().__init__()
-        found = f"{name}: this domain does not name its entities"
-        require(sizes.entities, "denoiser_args.initial_encoder", "flat", found)
+        reason = f"{name}: this domain does not name its entities"
+        require(sizes.entities, "denoiser_args.initial_encoder", "flat", reason)
         used = {column for entity in sizes.entities for column in entity}
         # One-hot entity types would break the symmetry, but they are constant, and constant columns are normalised to 0.
         shared = [column for column in range(sizes.vector_dim) if column not in used]
@@ -164,13 +164,12 @@ class _Entities(ConditionEncoder):
 
 
 class EntityEncoder(_Entities):
-    """Attention over entities: the concept attends to their attributes, not to their positions.
+    """Attention over entities, with the concept as query, attributes as keys and the other columns as values.
 
-    The concept determines a weight for each attribute column. The attention logit of an entity is the weighted sum of its
-    attributes, so the weights for *red* and for *bowl* add up to those of an unseen red bowl. The values exclude the attributes, so
-    a red bowl is approached like any other object; without named attributes all columns are keys and values. There is a single
-    head: several heads can disagree about the target, which traps concepts learned through them. The encoder is invariant to
-    exchanging entities.
+    The attention logit of an entity is linear in its attributes, so the queries of *red* and *bowl* add up to that of an unseen red
+    bowl. Values exclude the attributes, so a red bowl is approached like any other object. Without named attributes all columns are
+    keys and values. Attention has a single head: several heads can disagree about the target, and concepts learned through them get
+    stuck. The encoder is invariant to permutations of the entities.
     """
 
     def __init__(self, sizes: Sizes, width: int) -> None:
@@ -190,7 +189,7 @@ class EntityEncoder(_Entities):
         self.direct = nn.Linear(inner + len(self.shared), width)
 
     def observe(self, vector: Tensor) -> Context:
-        """Keys (attributes) and values of the entities, and the columns of no entity."""
+        """Keys (attributes) and values of the entities, and the shared columns."""
         shared, each = vector[:, self.shared], vector[:, self.columns]
         rest = each[..., self.rest]
         return each[..., self.attributes], self.value(torch.cat((self._hidden(rest, shared), rest), dim=-1)), shared
@@ -220,13 +219,13 @@ class SetEncoder(_Entities):
 
 
 class PointEncoder(ConditionEncoder):
-    """Attention over image points: the concept chooses points and reads their positions relative to each other and to the origin.
+    """Attention over image points, with the concept as query and point indices as keys.
 
-    Each of :data:`CHOSEN` choices is a weighted mean of the visible points. The weights depend on the concept alone (attention with
-    point indices as keys), so different concepts apply the same plan to different objects. Features of every chosen point, and of
-    every difference between two, are the vector, its direction and the logarithm of its length, which resolves near and far. The
-    coordinates of all points are additional features. If plans have a plane, all vectors and the plan are rotated into the
-    direction from the first chosen point to the second, so the encoder is equivariant to rotation.
+    Each of :data:`CHOSEN` choices is a weighted mean of the visible points. The weights depend only on the concept, so different
+    concepts apply the same plan to different objects. Features are the coordinates of all points, and for each chosen point and
+    each difference of two: the vector, its direction, and the logarithm of its length, which resolves small and large distances. If
+    plans have a plane, all vectors and the plan are rotated into the direction from the first chosen point to the second, which
+    makes the encoder equivariant to rotation.
 
     Raises:
         UserError: for an image encoder without points.
@@ -235,7 +234,7 @@ class PointEncoder(ConditionEncoder):
     def __init__(self, sizes: Sizes, width: int) -> None:
         super().__init__()
         has_points = sizes.image_dim > 0 and sizes.image_dim % POINT == 0
-        require(has_points, "denoiser_args.initial_encoder", "flat", "points: no points are read of images")
+        require(has_points, "denoiser_args.initial_encoder", "flat", "points: the image encoder has no head of points")
         self.count, self.turns = sizes.image_dim // POINT, bool(sizes.plane)
         self.choice = nn.Linear(sizes.concept_dim, CHOSEN * self.count)
         with torch.no_grad():  # every choice starts with a different preferred point
@@ -256,8 +255,8 @@ class PointEncoder(ConditionEncoder):
         """x, y, height and visibility of each choice ``(batch, choice, 4)``."""
         logits = SHARPNESS * self.choice(concept / concept.shape[-1] ** 0.5)
         weights = logits.unflatten(1, (CHOSEN, self.count)).softmax(dim=-1) * points[:, None, :, 3]
-        seen = weights.sum(dim=-1, keepdim=True)
-        return torch.cat((weights @ points[..., :3] / (seen + 1e-3), seen), dim=-1)
+        visibility = weights.sum(dim=-1, keepdim=True)
+        return torch.cat((weights @ points[..., :3] / (visibility + 1e-3), visibility), dim=-1)
 
     def direction(self, context: Context, concept: Tensor) -> Tensor | None:
         if not self.turns:
@@ -269,15 +268,16 @@ class PointEncoder(ConditionEncoder):
     def attend(self, context: Context, concept: Tensor) -> Tensor:
         measured, points = context
         chosen = self._chosen(points, concept)
-        places, seen = chosen[..., :2], points[..., 3:]
+        places, visibility = chosen[..., :2], points[..., 3:]
         first, second = torch.triu_indices(CHOSEN, CHOSEN, 1, device=places.device)
-        vectors = torch.cat((places, places[:, second] - places[:, first], seen * points[..., :2]), dim=1)
+        vectors = torch.cat((places, places[:, second] - places[:, first], visibility * points[..., :2]), dim=1)
         if (direction := self.direction(context, concept)) is not None:
             vectors = turned(vectors, direction, (0, 1), back=False)
         near, plain = vectors[:, : -self.count], vectors[:, -self.count :]
         length = (near.square().sum(dim=-1, keepdim=True) + SMALLEST**2).sqrt()
-        rest = (10 * chosen[..., 2], chosen[..., 3], 10 * (seen * points[..., 2:3])[..., 0], seen[..., 0], plain.flatten(1))
-        parts = (measured, near.flatten(1), (near / length).flatten(1), (length / SMALLEST).log()[..., 0] / 3, *rest)
+        of_chosen = measured, near.flatten(1), (near / length).flatten(1), (length / SMALLEST).log()[..., 0] / 3
+        heights = 10 * chosen[..., 2], chosen[..., 3], 10 * (visibility * points[..., 2:3])[..., 0], visibility[..., 0]
+        parts = (*of_chosen, *heights, plain.flatten(1))
         features: Tensor = self.net(torch.cat(parts, dim=1))
         return features
 

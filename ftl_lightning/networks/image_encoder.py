@@ -19,7 +19,7 @@ MOST_POINTS = 1000
 MOST_PIXELS = 100_000_000
 """Maximum number of values of an image."""
 GROUPS = 8
-"""Groups of group normalisation. It replaces batch normalisation, whose statistics a running average of the weights omits (Chi et
+"""Groups of group normalisation. It replaces batch normalisation, whose statistics are not part of an EMA of the weights (Chi et
 al., 2023)."""
 STRIDES = (2, 4)
 RESNET18 = "resnet18"
@@ -105,13 +105,13 @@ class ImageEncoder(nn.Module):
         network: ``'small'``, or ``'resnet18'`` (11 million weights).
         widths: channels of the small network's first convolution and of its residual blocks, multiples of 8.
         stride: stride of the small network's first convolution and so of its feature map, 2 or 4; 2 localises more precisely.
-        head: ``'keypoints'`` (spatial softmax), ``'points'`` (locations of objects that pretraining defines) or ``'grid'`` (all of
-            the last feature map, for the small map of ResNet-18).
-        keypoints: number of keypoints; of the grid, number of channels.
+        head: ``'keypoints'`` (spatial softmax), ``'points'`` (object positions, supervised in pretraining) or ``'grid'`` (the whole
+            last feature map, for the small map of ResNet-18).
+        keypoints: number of keypoints, or of channels of the grid.
         points: number of objects, for ``'points'``.
         crop: pixels removed from each side length: random crop in training, centre crop otherwise; 0 for none.
-        origin: name of an observed vector, the origin of keypoints or points, such as the position of a hand. Column and row
-            (-1 to 1) in the image for keypoints, x and y for points. Empty for the image centre.
+        origin: observed vector with the origin of keypoints (column and row in the image, -1 to 1) or points (x and y), such as
+            the position of a hand. Empty for the image centre.
 
     Raises:
         UserError: for an invalid value.
@@ -171,8 +171,8 @@ class ImageEncoder(nn.Module):
             corners = drawn(len(images), lambda n: torch.randint(self.crop + 1, (2, n, 1), device=images.device).movedim(1, 0))
             top, left = corners.unbind(dim=1)
             rows, columns = (first + torch.arange(side, device=images.device) for first, side in ((top, height), (left, width)))
-            every = torch.arange(len(images), device=images.device)[:, None, None]
-            images = images[every, :, rows[:, :, None], columns[:, None]].movedim(-1, 1)
+            batch = torch.arange(len(images), device=images.device)[:, None, None]
+            images = images[batch, :, rows[:, :, None], columns[:, None]].movedim(-1, 1)
         elif self.crop:
             middle = self.crop // 2
             images = images[:, :, middle : middle + height, middle : middle + width]
@@ -181,7 +181,7 @@ class ImageEncoder(nn.Module):
 
 
 class ImageEncoders(nn.Module):
-    """An :class:`ImageEncoder` with the same arguments for each observed image, with concatenated features.
+    """Concatenated features of all observed images, each encoded by an :class:`ImageEncoder` with the same arguments.
 
     Raises:
         UserError: for invalid arguments.
@@ -204,10 +204,10 @@ class ImageEncoders(nn.Module):
         """Images by name ``(batch, *shape)`` to ``(batch, size)``."""
         return torch.cat([encoder(observed[name]) for name, encoder in zip(self.names, self.encoders, strict=True)], dim=-1)
 
-    def from_origins(self, read: Tensor, observed: Observed) -> Tensor:
+    def from_origins(self, encoding: Tensor, observed: Observed) -> Tensor:
         """Shift keypoints in features ``(batch, size)``, possibly of earlier images, to be relative to the current origins."""
         parts = []
-        for part, origin, values in zip(read.split(self.sizes, dim=1), self.origins, self.values, strict=True):
+        for part, origin, values in zip(encoding.split(self.sizes, dim=1), self.origins, self.values, strict=True):
             if origin:
                 count = part.shape[1] // values
                 places, rest = part[:, : 2 * count], part[:, 2 * count :]

@@ -12,20 +12,20 @@ from ftl_lightning.services.randomness import Dropout
 from ftl_lightning.services.validation import check_range
 
 FEW = 8
-"""Minimum number of rows in a product: with fewer, libraries sum in another order."""
+"""Minimum number of rows of a matrix product: with fewer rows, BLAS sums in another order."""
 
 
 class MLPDenoiser(nn.Module):
     """Denoiser of the noisy plan, conditioned on the timestep, the concept and any observed features.
 
-    Timestep and concept scale and shift every hidden layer (FiLM, Perez et al., 2018). Inversion works better than with a concept
-    that is only concatenated to the input. Hidden layers are residual.
+    Timestep and concept scale and shift every hidden layer (FiLM, Perez et al., 2018), which inversion favours over a concept that
+    is only concatenated to the input. Hidden layers are residual.
 
     Args:
         sizes: sizes of plans, concepts and observed features.
         hidden_dim: width of the hidden layers.
         depth: number of hidden layers.
-        condition_dim: number of concept features. Width matters, as inversion only changes the concept.
+        condition_dim: number of concept features. Wide, as inversion only changes the concept.
         time_dim: number of timestep features; even.
         dropout: dropout of the hidden layers, in training.
         initial_encoder: ``'flat'`` (the paper's), ``'joint'``, ``'entities'``, ``'set'`` or ``'points'``,
@@ -115,9 +115,9 @@ class MLPDenoiser(nn.Module):
                 # Sum layer by layer: all layers together exceed the CPU cache.
                 return lambda part: of_concepts[part].index_select(0, index).add_(of_each[part])
             times, time_index = t.unique(return_inverse=True)
-            few = times[:1].expand(max(FEW - len(times), 0))
-            every = self.time_film(self.time(sinusoidal_embedding(torch.cat((times, few)), self.time_dim)))
-            of_times = self._by_layer(every[: len(times)])
+            padding = times[:1].expand(max(FEW - len(times), 0))
+            padded = self.time_film(self.time(sinusoidal_embedding(torch.cat((times, padding)), self.time_dim)))
+            of_times = self._by_layer(padded[: len(times)])
         if len(times) * len(concepts) <= len(t) and not torch.is_grad_enabled():
             pairs = [(time[:, None] + concept).flatten(0, 1) for time, concept in zip(of_times, of_concepts, strict=True)]
             pair = time_index * len(concepts) + index

@@ -166,8 +166,8 @@ class TemporalUNet(nn.Module):
         knots, times = concepts.shape[1], x.shape[1]
         parts = [self.time(sinusoidal_embedding(t, self.width))[:, None].expand(-1, knots, -1), self.concept(concepts)[index]]
         if self.initial is not None:
-            every = context if knots == 1 else tuple(part.repeat_interleave(knots, dim=0) for part in context)
-            parts.append(self.initial.attend(every, concepts[index].flatten(0, 1)).unflatten(0, (-1, knots)))
+            repeated = context if knots == 1 else tuple(part.repeat_interleave(knots, dim=0) for part in context)
+            parts.append(self.initial.attend(repeated, concepts[index].flatten(0, 1)).unflatten(0, (-1, knots)))
         condition = functional.mish(torch.cat(parts, dim=-1))
         inputs = [x.transpose(1, 2), self.clock.expand(len(x), -1, -1)]
         if self.broadcast:

@@ -48,7 +48,7 @@ class Encoder(Protocol):
 
 @dataclass(frozen=True)
 class TableEncoder:
-    """Looks up embeddings in a file from :func:`write_table`. Needs neither internet access nor a language model."""
+    """Lookup of embeddings in a file from :func:`write_table`, without internet access or a language model."""
 
     path: Path
 
@@ -124,8 +124,8 @@ class TransformerEncoder:
         try:
             config = AutoConfig.from_pretrained(self.name, revision=self.revision, trust_remote_code=False)
             kind = T5EncoderModel if config.model_type == "t5" else AutoModel
-            read: Any = kind.from_pretrained  # the annotation omits output_loading_info
-            model, info = read(
+            load: Any = kind.from_pretrained  # the annotation omits output_loading_info
+            model, info = load(
                 self.name, revision=self.revision, use_safetensors=True, output_loading_info=True, trust_remote_code=False
             )
         except Exception as error:  # many types, for a damaged folder
@@ -135,8 +135,8 @@ class TransformerEncoder:
             ) from error
         # Missing weights would be random; only the pooling layer is unused.
         missing = sorted(name for name in info["missing_keys"] if not name.startswith("pooler."))
-        found = f"none of {len(missing)}, such as {short(''.join(missing[:1]))!r}; download it again"
-        require(not missing, f"encoder: {self.name}", "all weights of the model", found)
+        absent = f"none of {len(missing)}, such as {short(''.join(missing[:1]))!r}; download it again"
+        require(not missing, f"encoder: {self.name}", "all weights of the model", absent)
         network: PreTrainedModel = model.eval()
         return network
 
@@ -145,8 +145,8 @@ class HashingEncoder:
     """Signed feature hashing (Weinberger et al., 2009), without data, internet access or a language model.
 
     Features of a text are its words, pairs of neighbouring words, and the pieces of :data:`PIECE` letters of each word with marked
-    ends, so that 'circle' and 'circles' are near each other. Each feature adds +1 or -1 to a column. SHA-256 decides sign and
-    column, so embeddings are the same on every machine. Meanings are unknown: 'big' and 'large' have nothing in common.
+    ends, so that 'circle' and 'circles' are similar. Each feature adds +1 or -1 to a column. SHA-256 decides sign and
+    column, so embeddings are the same on every machine. Synonyms are unrelated: 'big' and 'large' share no word.
     """
 
     @property
@@ -181,8 +181,8 @@ def load_encoder(name: str, table: Path | None, revision: str = "main") -> Encod
     """Load an encoder by name.
 
     Args:
-        name: ``'table'`` (the domain's shipped embeddings), ``'minilm'`` (the extra), ``'hashing'`` (no language model: words and
-            letters without meanings), ``'auto'`` (``'minilm'`` if installed, else ``'hashing'``), or a Hugging Face name or path.
+        name: ``'table'`` (the domain's shipped embeddings), ``'minilm'`` (the extra), ``'hashing'`` (:class:`HashingEncoder`),
+            ``'auto'`` (``'minilm'`` if installed, else ``'hashing'``), or a Hugging Face name or path.
         table: file for ``'table'``; ``None`` if the domain ships none.
         revision: revision of a Hugging Face model.
 

@@ -163,7 +163,7 @@ def overview(results: pd.DataFrame) -> Table:
 
 
 def short_overview(results: pd.DataFrame) -> Table:
-    """The overview in at most :data:`LINES` lines; our other forms are the chosen one and the default form of the domain."""
+    """The overview in at most :data:`LINES` lines; our other forms are the chosen form and the default form of the domain."""
     domains = _domains(results)
     defaults = {domain.comparison.ours for domain in domains}
     columns = [

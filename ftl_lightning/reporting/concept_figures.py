@@ -71,7 +71,7 @@ def concept_map(model: ConceptModel, concepts: Sequence[Concept], seed: int = 0)
 
 
 def check_figure(checks: Sequence[Check]) -> Figure:
-    """Plot demonstrations, distances and leave-one-out losses, odd ones in red; a row for each of :data:`MOST` concepts at most."""
+    """Plot demonstrations, distances and leave-one-out losses, outliers in red; a row for each of :data:`MOST` concepts at most."""
     shown = checks[:MOST]
     columns = 2 + 2 * any(check.left_out for check in shown)
     figure = Figure(figsize=(3.2 * columns, 3.0 * len(shown)), layout="constrained")
@@ -118,9 +118,9 @@ def _behaviour(axes: Axes, check: Check, odd: set[int]) -> None:
 
 
 def _distances(axes: Axes, check: Check) -> None:
-    apart = distances(check.demonstrations)
-    axes.imshow(apart.numpy(), cmap="Blues")
-    numbers = range(len(apart)) if len(apart) <= 12 else range(0)
+    gaps = distances(check.demonstrations)
+    axes.imshow(gaps.numpy(), cmap="Blues")
+    numbers = range(len(gaps)) if len(gaps) <= 12 else range(0)
     labels = [str(number + 1) for number in numbers]
     axes.set_xticks(numbers, labels)
     axes.set_yticks(numbers, labels)

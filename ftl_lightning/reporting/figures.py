@@ -86,7 +86,7 @@ def _label_bars(axes: Axes, places: Sequence[float], shown: Sequence[str], metri
 
 
 def accuracy_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy") -> Figure:
-    """Plot a metric of every setting beside the paper's numbers and reference lines, for K = 2 or else the most measured K. Error
+    """Plot a metric of every setting beside the paper's numbers and reference lines, for K = 2, else the K with most rows. Error
     bars are standard errors over tasks. ``results`` are rows of a results file.
     """
     rows = labelled(latest(select(results, domain=domain.name, metric=metric)))

@@ -138,8 +138,8 @@ def _notes(row: Mapping[str, Any], values: Mapping[str, float], metric: str, row
         return [f"{row['n']} samples of seed {row['seed']}"]
     if same.empty:
         return [f"{metric} {values[metric]:.2f} of {row['n']}, seed {row['seed']}"]
-    seen = select(same, seed=row["seed"])
-    notes = [f"seed {row['seed']}: {seen['value'].mean():.2f} of {seen['n'].iloc[-1]}"] if not seen.empty else []
+    of_seed = select(same, seed=row["seed"])
+    notes = [f"seed {row['seed']}: {of_seed['value'].mean():.2f} of {of_seed['n'].iloc[-1]}"] if not of_seed.empty else []
     return [f"{metric} {same['value'].mean():.2f} over {same['seed'].nunique()} seeds", *notes]
 
 

@@ -25,14 +25,14 @@ def sign_flip(parts: Sequence[float]) -> float:
     are at least as far from zero. ``parts`` are the contributions of the pairs to the mean difference.
     """
     moving = np.array([part for part in parts if abs(part) > ROUNDING])
-    far = abs(moving.sum()) - ROUNDING
+    threshold = abs(moving.sum()) - ROUNDING
     if len(moving) <= EXACT:
         sums = np.zeros(1)
         for part in moving:
             sums = np.concatenate((sums + part, sums - part))
-        return float(np.mean(np.abs(sums) >= far))
+        return float(np.mean(np.abs(sums) >= threshold))
     signs = np.random.default_rng(0).choice((-1.0, 1.0), (DRAWS, len(moving)))
-    return float((1 + np.sum(np.abs(signs @ moving) >= far)) / (DRAWS + 1))
+    return float((1 + np.sum(np.abs(signs @ moving) >= threshold)) / (DRAWS + 1))
 
 
 def holm(values: Sequence[float]) -> list[float]:
@@ -53,12 +53,12 @@ def reachable(signs: int, tests: int) -> bool:
 
 @dataclass(frozen=True)
 class Lead:
-    """Ours against a baseline, in one setting and metric.
+    """Ours against a baseline, in a setting and a metric.
 
     Attributes:
         difference: mean over tasks of means over seeds; positive if ours is better.
-        pairs, same: number of pairs (task, seed) with both methods, and whether every pair is equal.
-        p: p after Holm's correction; ``None`` for too few pairs.
+        pairs, same: number of pairs (task, seed) with both methods, and whether all pairs are equal.
+        p: p-value after Holm's correction; ``None`` for too few pairs.
     """
 
     baseline: Compared
@@ -69,7 +69,7 @@ class Lead:
 
     @property
     def verdict(self) -> str:
-        """One of the five verdicts of this module."""
+        """Verdict, from the five of this module."""
         if self.same:
             return SAME
         if self.p is None:
@@ -113,11 +113,11 @@ def leads(rows: pd.DataFrame, ours: Compared, baselines: Sequence[Compared], les
     Seeds of a task are not independent tasks. With enough tasks, the signs of whole tasks are flipped, and p generalises to similar
     tasks. Else the signs of (task, seed) pairs are flipped, and p generalises to new seeds (demonstrations, learning and samples,
     not the pretrained model) of the same tasks. With too few pairs (a single task and three seeds have p >= .25) there is no
-    verdict. A number is enough if it can reach :data:`LEVEL` after Holm's correction for the number of baselines, which also
+    verdict. Enough means that p can fall below :data:`LEVEL` after Holm's correction for the number of baselines, which also
     covers the choice of the best baseline afterwards.
 
     Args:
-        rows: rows of one setting and metric, with ``task``, ``seed``, ``method``, ``form`` and ``value``.
+        rows: rows of a setting and a metric, with ``task``, ``seed``, ``method``, ``form`` and ``value``.
         baselines: methods to compare with; methods without rows are left out.
         less: whether less is better.
     """
@@ -152,8 +152,8 @@ def _parts(differences: pd.Series, tests: int) -> list[float]:
 
 
 def least_certain(compared: Sequence[Lead]) -> Lead | None:
-    """The lead for a single verdict: *ahead* of every baseline, or *behind* at least one; if equal, over the best. ``None`` without
-    leads.
+    """Lead that decides the overall verdict: *behind* before undecided before *ahead*, then the smallest difference; ``None``
+    without leads.
     """
     return min(compared, key=lambda lead: ({BEHIND: 0, AHEAD: 2}.get(lead.verdict, 1), lead.difference), default=None)
 

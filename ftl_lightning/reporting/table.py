@@ -104,7 +104,7 @@ def select(rows: pd.DataFrame, **values: object) -> pd.DataFrame:
 
 
 def of_method(rows: pd.DataFrame, method: Compared) -> pd.DataFrame:
-    """Select the rows of a method in one form."""
+    """Select the rows of a method and form."""
     return select(rows, method=method.name, form=method.form)
 
 
@@ -121,7 +121,7 @@ def beside_paper(number: Number | None, papers: Published | None) -> list[str]:
 
 
 def domain_of(name: str, rows: pd.DataFrame) -> Domain:
-    """The domain of results; if it is not installed, or of user data, made from the rows. Raise UserError for an invalid name."""
+    """Domain of results, made from the rows if it is not installed or of user data. Raise UserError for an invalid name."""
     is_name = re.fullmatch(r"\w[\w .+-]{0,99}", name)
     require(is_name, "results: column 'domain'", "a name of letters, digits and - . +", shown(name))
     if name != OWN and not is_known(name):
@@ -137,7 +137,7 @@ def domain_of(name: str, rows: pd.DataFrame) -> Domain:
 
 
 def _unknown(*arguments: object) -> NoReturn:
-    raise UserError("domain: expected an installed one, found one that is known by its results alone; install its package")
+    raise UserError("domain: expected an installed domain, found only its results; install its package")
 
 
 def _suite(domain: Domain, name: str) -> tuple[str, ...]:
@@ -156,8 +156,8 @@ def component_tasks(domain: Domain) -> tuple[EvaluationTask, ...]:
 
 def settings(domain: Domain, rows: pd.DataFrame) -> list[str]:
     """Settings with results: training settings, the paper's, then others in order of appearance."""
-    apart = {task.setting for task in component_tasks(domain)}
-    measured = [setting for setting in dict.fromkeys(rows["setting"]) if setting not in apart]
+    separate = {task.setting for task in component_tasks(domain)}
+    measured = [setting for setting in dict.fromkeys(rows["setting"]) if setting not in separate]
     order = dict.fromkeys((*training_settings(domain), *_suite(domain, PAPER), *measured))
     return [setting for setting in order if setting in measured]
 

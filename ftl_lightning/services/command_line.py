@@ -1,4 +1,4 @@
-"""Arguments of a verb, read once: early checks of files, before slow imports, and one-line messages for a parser's errors."""
+"""Arguments of a verb: early checks of files, before slow imports, and short messages for a parser's errors."""
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
@@ -226,7 +226,7 @@ _KEY = re.compile(r"""(?:[Kk]ey|[Oo]ption) ['"]([\w.]+)['"]""")
 
 
 def one_line(message: str, verb: str, arguments: Arguments) -> str:
-    """Shorten a message of jsonargparse to one line: file and line, if a configuration file has the key; then the mistake.
+    """Shorten a message of jsonargparse to a single line: file and line, if a configuration file has the key; then the mistake.
 
     The configuration files of ``arguments`` are searched for the key unless an option names it.
     """

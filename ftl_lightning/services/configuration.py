@@ -92,7 +92,7 @@ def _plain(keys: object) -> dict[str, Any]:
 def _merged(path: Path, section: str | None, above: tuple[Path, ...]) -> Iterator[tuple[Path, dict[str, Any]]]:
     """Files with their keys, the section's after the others. ``above``: files that include this file."""
     if path.resolve() in (parent.resolve() for parent in above):
-        raise UserError(f"{above[-1]}: key '{DEFAULTS}': {path} builds on {above[-1]} itself; leave one of them out")
+        raise UserError(f"{above[-1]}: key '{DEFAULTS}': {path} builds on {above[-1]} itself; remove either from its list")
     keys = _read(path)
     names = keys.pop(DEFAULTS, None) or []
     valid = isinstance(names, list) and all(isinstance(name, str) for name in names)
@@ -112,9 +112,9 @@ def _beside(path: Path, name: str) -> Path:
     try:
         for folder in path.absolute().parents:
             if (folder / name).is_file():
-                found = folder / name
-                relative = not path.is_absolute() and found.is_relative_to(Path.cwd())  # as the user's path is
-                return found.relative_to(Path.cwd()) if relative else found
+                file = folder / name
+                relative = not path.is_absolute() and file.is_relative_to(Path.cwd())  # as the user's path is
+                return file.relative_to(Path.cwd()) if relative else file
         if (ours := shipped(name)).is_file():
             return ours
     except (OSError, ValueError) as error:  # a name that no file can have, or a folder that cannot be read

@@ -42,7 +42,7 @@ def require(condition: object, place: str, expected: str, found: object) -> None
 
 @contextmanager
 def about(where: str | Path) -> Iterator[None]:
-    """Put the name of a file before a :class:`UserError` in its content; at most :data:`LONGEST` characters for short names."""
+    """Prefix a :class:`UserError` of the block with a file name; :data:`LONGEST` characters at most unless the name is long."""
     try:
         yield
     except UserError as error:
@@ -58,11 +58,11 @@ def mistake_behind(error: BaseException | None) -> UserError | None:
 
 
 def mistake_of_machine(error: BaseException) -> str | None:
-    """Line for an error of the machine that a user can correct, an inaccessible file or too little memory; ``None`` for others."""
+    """Message for an inaccessible file or too little memory, which a user can correct; ``None`` for other errors."""
     if isinstance(error, OSError):
         where = short(str(error.filename or "a file"), 150)
         reason = error.strerror or short(str(error))
-        return f"{where}: expected a place that can be read and written, found another ({reason}); choose another one"
+        return f"{where}: expected a place that can be read and written, found another ({reason}); choose another place"
     text = str(error)
     if isinstance(error, MemoryError) or any(words in text for words in _NO_MEMORY):
         return (

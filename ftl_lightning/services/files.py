@@ -1,7 +1,7 @@
 """Check paths of inputs and outputs before files are read or written.
 
-The limits are far above the sizes of honest files, and far below what would hang a laptop. An environment variable
-(:data:`VARIABLE`, in bytes) raises them for files of tensors and their compressed content.
+Size limits are far above legitimate files and far below a laptop's memory. An environment variable (:data:`VARIABLE`, in bytes)
+raises them for files of tensors and their compressed content.
 """
 
 import os
@@ -31,7 +31,7 @@ def most_bytes() -> int:
     """:data:`MOST_BYTES`, or the value of the environment variable.
 
     Raises:
-        UserError: if the value is no number of bytes.
+        UserError: if the value is not a number of bytes.
     """
     text = os.environ.get(VARIABLE, "")
     require(not text or (text.isdecimal() and len(text) < 20), VARIABLE, "a number of bytes", repr(short(text)))
@@ -130,7 +130,7 @@ def _named(path: str | Path, key: str) -> str:
 
 
 def check_file(path: str | Path, key: str = "", kind: str = "file") -> None:
-    """Refuse an existing path that is no regular file or no folder, but a device, a pipe, a socket, or a link to one.
+    """Refuse an existing path of another kind, such as a device, a pipe, a socket, or a link to any of them.
 
     Args:
         path: path to write.

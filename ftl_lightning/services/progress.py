@@ -1,4 +1,4 @@
-"""Progress of long work: one moving bar in a terminal, a few plain lines elsewhere. Both go to standard error."""
+"""Progress of long work on standard error: a moving bar in a terminal, a few plain lines elsewhere."""
 
 import sys
 import time
@@ -17,14 +17,14 @@ LINES = 10
 
 
 class Advance(Protocol):
-    """Move a bar on by some steps; the text ``told`` beside it, such as a loss, stays until it is replaced."""
+    """Move a bar on by some steps. The ``note`` beside it, such as a loss, stays until it is replaced."""
 
-    def __call__(self, steps: int = 1, told: str = "") -> None: ...
+    def __call__(self, steps: int = 1, note: str = "") -> None: ...
 
 
 @dataclass
 class _Screen:
-    """State of all bars: the number of open bars, and in a terminal their display, whose last bar is the innermost."""
+    """State of all bars: the number of open bars, and in a terminal their display, innermost bar last."""
 
     depth: int = 0
     display: "Progress | None" = None
@@ -77,8 +77,8 @@ def _display() -> "Progress":
         TextColumn("{task.fields[steps]}"),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
-        TextColumn("{task.fields[told]}", markup=False),
-        console=Console(stderr=True, soft_wrap=True),  # printed paths stay in one line
+        TextColumn("{task.fields[note]}", markup=False),
+        console=Console(stderr=True, soft_wrap=True),  # no line breaks in printed paths
         transient=True,
         # If standard output is a file, printed text must go there, not to the terminal.
         redirect_stdout=sys.stdout.isatty(),
@@ -101,15 +101,15 @@ class _Bar:
     def show(self) -> None:
         self.first = self.done
         if _SCREEN.display is not None:
-            self.task = _SCREEN.display.add_task(self.title, total=self.total, completed=self.done, steps=self._steps(), told="")
+            self.task = _SCREEN.display.add_task(self.title, total=self.total, completed=self.done, steps=self._steps(), note="")
         elif self.lines:
             say(f"{self.title}: {self._steps()}" if self.total else self.title, error=True)
 
-    def advance(self, steps: int = 1, told: str = "") -> None:
+    def advance(self, steps: int = 1, note: str = "") -> None:
         before, self.done = self.done, self.done + steps
-        self.note = plain(told) or self.note
+        self.note = plain(note) or self.note
         if _SCREEN.display is not None and self.task is not None:
-            _SCREEN.display.update(self.task, advance=steps, steps=self._steps(), told=self.note)  # type: ignore[arg-type]
+            _SCREEN.display.update(self.task, advance=steps, steps=self._steps(), note=self.note)  # type: ignore[arg-type]
         elif self.lines and self.total and LINES * before // self.total < LINES * self.done // self.total < LINES:
             say(f"{self.title}: {self._steps()}, {self._time()}", error=True)
 

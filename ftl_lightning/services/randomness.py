@@ -36,7 +36,7 @@ def task_key(task: str) -> int:
 
 @dataclass
 class _Rows:
-    """Rows of process ``rank`` of ``world``."""
+    """Share of the joint batch: rows of process ``rank`` of ``world``."""
 
     rank: int = 0
     world: int = 1
@@ -48,7 +48,7 @@ _ROWS = _Rows()
 
 @contextmanager
 def rows_of(rank: int, world: int) -> Iterator[None]:
-    """Draw and average over the batch of all ``world`` processes within the block, in the process ``rank``."""
+    """Within the block, draw and average over the joint batch of ``world`` processes, of which this is number ``rank``."""
     before = _ROWS.rank, _ROWS.world
     _ROWS.rank, _ROWS.world = rank, world
     try:

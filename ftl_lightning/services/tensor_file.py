@@ -92,7 +92,7 @@ def _remove_left(folder: Path, begin: str, end: str) -> None:
 
 @contextmanager
 def alone(folder: str | Path) -> Iterator[None]:
-    """Lock a folder, so that processes that change the same files in it wait for one another. It is made if missing."""
+    """Lock a folder, made if missing, so that processes change its files in turn."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     handle = os.open(folder, os.O_RDONLY)
@@ -134,7 +134,7 @@ def serialise(kind: str, tensors: Mapping[str, Tensor], header: Mapping[str, Any
 def save_tensors(
     path: str | Path, kind: str, tensors: Mapping[str, Tensor], header: Mapping[str, Any], version: int = FORMAT
 ) -> None:
-    """Write the bytes of :func:`serialise`, with the same arguments, whole or not at all."""
+    """Write the bytes of :func:`serialise`, with the same arguments, atomically."""
     with atomic(path) as temporary:
         temporary.write_bytes(serialise(kind, tensors, header, version))
 

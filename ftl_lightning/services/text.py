@@ -101,7 +101,7 @@ MOST_DRAWN = 120
 
 
 def latex(text: str) -> str:
-    """Escape a text for LaTeX in one line, without commands and formulas; for a row of a table see :func:`latex_row`."""
+    """Escape a text for LaTeX on a single line, without commands and formulas; for a row of a table see :func:`latex_row`."""
     return line(text).translate(_LATEX)
 
 
@@ -112,7 +112,7 @@ def latex_row(cells: list[str]) -> str:
 
 
 def markdown(text: str) -> str:
-    """Escape a text for a cell or caption in GitHub's Markdown: one line, no HTML, link, picture, formula, code or new cell."""
+    """Escape a text for a cell or caption in GitHub's Markdown: no line break, HTML, link, picture, formula, code or new cell."""
     return _MARKDOWN.sub(lambda match: _ENTITIES.get(match[0], f"\\{match[0]}"), line(text))
 
 
@@ -122,6 +122,6 @@ def script_json(content: Any) -> str:
 
 
 def figure_text(text: str) -> str:
-    """Escape a text for a figure in one line. Matplotlib reads dollars as formulas; legends omit names that begin with ``_``."""
+    """Escape a text for a figure. Dollars are formulas to Matplotlib; legends omit names that begin with ``_``."""
     label = short(line(text), MOST_DRAWN).replace("$", r"\$")
     return f" {label}" if label.startswith("_") else label

@@ -58,7 +58,7 @@ def entry_points(group: str) -> list[EntryPoint]:
 
 
 def is_installed(module: str) -> bool:
-    """Whether a module's package is found without the current folder. Nothing is imported."""
+    """Whether a module's package is on Python's path without the current folder. Nothing is imported."""
     if any(module == folder or module.startswith(f"{folder}.") for folder in NO_CODE):
         return False
     package, path = module.partition(".")[0], search_path()
@@ -75,8 +75,8 @@ def is_vouched(reference: str) -> bool:
     return reference in names or any(module == name or module.startswith(f"{name}.") for name in names)
 
 
-def vouched() -> frozenset[str]:
-    """All names that the user trusts, for other processes."""
+def trusted_names() -> frozenset[str]:
+    """Names that the user trusts, to pass on to other processes."""
     return _vouched.get()
 
 

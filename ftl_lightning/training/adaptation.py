@@ -57,8 +57,8 @@ class Adaptation(pl.LightningModule, ABC):
         self.domain = self.model.domain
         self._omega, self._output = omega, output
         self.concepts: tuple[str, ...] = ()
-        self._found: dict[str, Concept] = {}
-        self._own = False  # whether the demonstrations are a user's, not a domain's tasks
+        self._learned: dict[str, Concept] = {}
+        self._of_user = False  # whether the demonstrations are a user's, not of a domain's tasks
 
     @classmethod
     @abstractmethod
@@ -86,8 +86,8 @@ class Adaptation(pl.LightningModule, ABC):
 
     def learned(self) -> dict[str, Concept]:
         """Concepts by name, which are learned once."""
-        self._found = self._found or self.learn()
-        return self._found
+        self._learned = self._learned or self.learn()
+        return self._learned
 
     def configure_model(self) -> None:
         """Set the demonstrations and check that they fit the model.
@@ -98,12 +98,13 @@ class Adaptation(pl.LightningModule, ABC):
         data = self.trainer.datamodule  # type: ignore[attr-defined]
         if not isinstance(data, InversionData):
             raise UserError(f"data.class_path: expected InversionData, found {type(data).__name__}")
-        mine = self.model.config.domain
-        if data.domain_name != mine and (OWN in (mine, data.domain_name) or load_domain(data.domain_name) is not self.model.domain):
-            raise UserError(f"data.domain: expected {mine!r} (the pretrained model's), found {data.domain_name!r}")
+        trained = self.model.config.domain
+        names = trained, data.domain_name
+        if len(set(names)) > 1 and (OWN in names or load_domain(data.domain_name) is not self.model.domain):
+            raise UserError(f"data.domain: expected {trained!r} (the pretrained model's), found {data.domain_name!r}")
         self.concepts = data.concepts
         self._files = concept_files(self.concepts, self.folder, "concepts")
-        self._found = {}
+        self._learned = {}
         expected, columns = len(self.domain.plans.columns), data.demonstrations.states.shape[2]
         if columns != expected:
             raise UserError(f"data.demonstrations: expected states of {expected} columns (the pretrained model's), found {columns}")
@@ -111,11 +112,11 @@ class Adaptation(pl.LightningModule, ABC):
             self.demonstrations: Demonstrations = data.demonstrations.fitted(self.domain.observed)
         except UserError as error:
             raise UserError(f"data.demonstrations: {error}") from None
-        self._own = data.own
+        self._of_user = data.of_user
         if self.model.examples is not None:  # a user's data: new concepts are judged by their demonstrations
             self.domain = judging_domain(self.model, [self.model.examples, self.demonstrations])
         longer = longer_than_plans(self.demonstrations, self.model)
-        for note in notes_of(self.model, self.demonstrations) if self._own else [longer] if longer else []:
+        for note in notes_of(self.model, self.demonstrations) if self._of_user else [longer] if longer else []:
             say(f"note: {note}", error=True)
 
     def training_step(self, batch: int) -> None:
@@ -128,7 +129,7 @@ class Adaptation(pl.LightningModule, ABC):
 
     def test_step(self, batch: int) -> None:
         """Log the loss of the learned concepts on common noise; the evaluator judges behaviour."""
-        losses = [concept.origin.loss for concept in self._found.values()]
+        losses = [concept.origin.loss for concept in self._learned.values()]
         self.log("test/loss", sum(losses) / len(losses), batch_size=1)
 
     def train(self, mode: bool = True) -> "Adaptation":
@@ -151,7 +152,7 @@ class Adaptation(pl.LightningModule, ABC):
         """Learn the concepts and write each to a file."""
         log_folder.keep()  # also without training
         for name, concept in self.learned().items():
-            write_concept(concept, self._files[name], self._quality(name, concept) if self._own else None)
+            write_concept(concept, self._files[name], self._quality(name, concept) if self._of_user else None)
 
     def _quality(self, name: str, concept: Concept) -> Inspection | None:
         """Quality of the samples of a user's concept, also drawn into TensorBoard; ``None`` if it cannot be measured."""
@@ -164,7 +165,7 @@ class Adaptation(pl.LightningModule, ABC):
         return inspection
 
     def on_test_start(self) -> None:
-        if not self._found:  # else training in the same process has just ended
+        if not self._learned:  # else training in the same process has just ended
             self.find()
 
     def training_weight(self, task: EvaluationTask) -> float:
@@ -177,14 +178,14 @@ class Adaptation(pl.LightningModule, ABC):
         The modes of a learned concept are used if it is not composed.
         """
         if len(task.learned) == 1 and task.component is None and not (task.texts or task.without):
-            concept = self._found.get(task.learned[0])
+            concept = self._learned.get(task.learned[0])
             return None if concept is None else concept.composition.to(self.device)
         weights = [self.training_weight(task)] * len(task.texts) + [WITHOUT_WEIGHT] * len(task.without)
         embeddings = [self.model.concept(text)[None, None] for text in (*task.texts, *task.without)]
         parts = [Composition(text, text.new_tensor([weight])) for text, weight in zip(embeddings, weights, strict=True)]
         names = [*task.texts, *task.without, *task.learned]
         for name in task.learned:
-            concept = self._found.get(name)
+            concept = self._learned.get(name)
             if concept is None or (task.component or 0) > len(concept.weights):
                 return None
             parts.append((concept.composition if task.component is None else concept.component(task.component)).to(self.device))
@@ -203,7 +204,7 @@ class Adaptation(pl.LightningModule, ABC):
         """All embeddings, for the projector: training concepts and learned components."""
         learned = [
             Point(name, NEW_COMPONENT, part.embedding, part)
-            for name, concept in self._found.items()
+            for name, concept in self._learned.items()
             for part in concept.parts().values()
         ]
         return self.model.points() + learned

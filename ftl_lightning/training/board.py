@@ -114,12 +114,12 @@ class TrainingBar(ProgressBar):
         if self._advance is not None:
             if look := time.monotonic() - self._looked > REFRESH:
                 self._looked = time.monotonic()
-            self._advance(trainer.global_step - self._shown, told(trainer) if look else "")
+            self._advance(trainer.global_step - self._shown, logged_metrics(trainer) if look else "")
             self._shown = trainer.global_step
 
     def on_train_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         if self._advance is not None:
-            self._advance(0, told(trainer))
+            self._advance(0, logged_metrics(trainer))
         self._close()
 
     def on_validation_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
@@ -142,7 +142,7 @@ class TrainingBar(ProgressBar):
         self._open.__exit__(type(exception), exception, exception.__traceback__)
 
 
-def told(trainer: pl.Trainer) -> str:
+def logged_metrics(trainer: pl.Trainer) -> str:
     """Logged loss and accuracy of a run: ``loss 0.031, accuracy 0.98``."""
     metrics = trainer.callback_metrics
     loss = [f"loss {metrics['train/loss']:.3g}"] if "train/loss" in metrics else []

@@ -128,20 +128,20 @@ def last_checkpoint(trainer: pl.Trainer) -> Path | None:
     return max((path for path in paths if path.is_file()), key=lambda path: path.stat().st_mtime, default=None)
 
 
-def check_parameters(found: Mapping[str, Any], module: pl.LightningModule) -> None:
+def check_parameters(parameters: Mapping[str, Any], module: pl.LightningModule) -> None:
     """Refuse checkpoint parameters that do not fit a module.
 
     Raises:
         UserError: for the first missing, unknown or non-finite parameter, or another shape.
     """
     expected = module.state_dict()
-    for name in expected | dict(found):
+    for name in expected | dict(parameters):
         place = f"ckpt_path: key 'state_dict', {name!r}"
-        require(name in found, place, "it", "nothing; it is damaged")
+        require(name in parameters, place, "it", "nothing; it is damaged")
         require(name in expected, place, "nothing", "it; it is damaged")
-        shapes = tuple(expected[name].shape), tuple(found[name].shape)
+        shapes = tuple(expected[name].shape), tuple(parameters[name].shape)
         require(shapes[0] == shapes[1], place, f"shape {shapes[0]}", f"{shapes[1]}; it is damaged")
-    check_finite(found, "ckpt_path: key 'state_dict'", "take an older checkpoint")
+    check_finite(parameters, "ckpt_path: key 'state_dict'", "take an older checkpoint")
 
 
 def check_restored(module: pl.LightningModule, step: int) -> None:
@@ -171,7 +171,7 @@ class Random(NamedTuple):
     Attributes:
         cpu: state of the CPU generator.
         cuda: state of the module's GPU generator; ``None`` on a CPU.
-        iterations: loader iterations that an unbroken run starts before its next step; each draws one number.
+        iterations: loader iterations that an uninterrupted run starts before its next step; each draws a number.
     """
 
     cpu: Tensor
@@ -184,7 +184,7 @@ class Random(NamedTuple):
         return cls(torch.get_rng_state(), torch.cuda.get_rng_state(device) if device.type == "cuda" else None, iterations)
 
     def restore(self, device: torch.device) -> None:
-        """Set the generators as in an unbroken run before its next step."""
+        """Restore the global generators to their states before the next step of an uninterrupted run."""
         torch.set_rng_state(self.cpu)
         for _ in range(self.iterations):
             torch.empty((), dtype=torch.int64).random_()

@@ -96,7 +96,7 @@ class ConceptModel(Shown, nn.Module, ABC):
         generators: Sequence[torch.Generator],
         observed: Observed | None = None,
     ) -> Tensor:
-        """Sample behaviour for several compositions in one batch.
+        """Sample behaviour for several compositions in a single batch.
 
         Args:
             compositions: ``(K, ...)`` each; K may differ.
@@ -169,7 +169,7 @@ class ConceptModel(Shown, nn.Module, ABC):
         return Origin(name, *space, selected.hash, len(selected), weights, loss)
 
     def draws(self, samples: int, timestep_power: float, draw: torch.Generator) -> Draws | None:
-        """Random numbers of :meth:`losses`, shared by all runs; ``None`` for a deterministic loss."""
+        """Random numbers of :meth:`losses`, common to all runs; ``None`` for a deterministic loss."""
         return None
 
     def windows(
@@ -180,7 +180,7 @@ class ConceptModel(Shown, nn.Module, ABC):
         Args:
             rows: row of the demonstration of each window ``(row,)``.
             share: relative start of each window ``(row,)``, 0 to 1.
-            draw: generator of the perturbation, if the model is configured with one.
+            draw: generator of the perturbation, if configured.
         """
         plans = self.domain.plans
         starts = demonstrations.starts(rows, share, plans.exponent(self.window), self.window, plans.at_rest)
@@ -285,28 +285,28 @@ class ConceptModel(Shown, nn.Module, ABC):
         """
         if not self.config.observed:
             return None
-        seen = self._seen(observed)
+        viewed = self._viewed(observed)
         parts = []
-        if (vectors := self._vectors(seen)) is not None:
+        if (vectors := self._vectors(viewed)) is not None:
             parts.append(self._dropped(vectors) if self.training else vectors)
         if self.images is not None:
-            parts.append(self.images.from_origins(observed[READ] if READ in observed else self.images(seen), seen))
+            parts.append(self.images.from_origins(observed[READ] if READ in observed else self.images(viewed), viewed))
         return torch.cat(parts, dim=-1)
 
     def vectors(self, observed: Observed) -> Tensor | None:
         """Normalised observed vectors ``(batch, m)``, without image encodings; ``None`` without any."""
-        return None if self.initial_normalization is None else self._vectors(self._seen(observed))
+        return None if self.initial_normalization is None else self._vectors(self._viewed(observed))
 
-    def _vectors(self, seen: Observed) -> Tensor | None:
+    def _vectors(self, viewed: Observed) -> Tensor | None:
         normalization = self.initial_normalization
-        return None if normalization is None else normalization.encode(joined_vectors(seen, self.config.observed))
+        return None if normalization is None else normalization.encode(joined_vectors(viewed, self.config.observed))
 
     def of_images(self, observed: Observed) -> Tensor | None:
-        """Image encodings ``(batch, n)``, for methods that encode images once and vectors often; ``None`` without images."""
-        read: Tensor | None = None if self.images is None else self.images(self._seen(observed))
-        return read
+        """Image encodings ``(batch, n)``, for methods that encode images once, vectors at every step; ``None`` without images."""
+        encodings: Tensor | None = None if self.images is None else self.images(self._viewed(observed))
+        return encodings
 
-    def _seen(self, observed: Observed) -> Observed:
+    def _viewed(self, observed: Observed) -> Observed:
         read = READ in observed
         if self.view is not None:
             check_features(observed, _unread(self.domain.observed, read))
@@ -338,8 +338,8 @@ class ConceptModel(Shown, nn.Module, ABC):
 class TextConceptModel(ConceptModel):
     """A model whose concept space is the text encoder's.
 
-    Embeddings are centred on the training concepts and scaled to unit mean square, since language models' embeddings share a
-    large common part, which hides differences.
+    Embeddings are centred on the training concepts and scaled to unit mean square: embeddings of language models have a large
+    common component, which hides differences.
 
     Args:
         prepared: inputs with the encoder's embeddings.

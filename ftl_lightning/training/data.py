@@ -219,8 +219,8 @@ class PretrainingData(pl.LightningDataModule):
         return DataLoader(steps, batch_size=None, collate_fn=self.batch)  # type: ignore[arg-type]
 
     def val_dataloader(self) -> DataLoader[Batch]:
-        whole = torch.arange(len(self.validation))
-        batch = self._windows(self.validation, whole, generator("cpu", self.seed))
+        rows = torch.arange(len(self.validation))
+        batch = self._windows(self.validation, rows, generator("cpu", self.seed))
         return DataLoader([batch], batch_size=None)  # type: ignore[arg-type]
 
     test_dataloader = val_dataloader
@@ -236,7 +236,7 @@ class OwnData(PretrainingData):
             :meth:`ftl_lightning.data.demonstrations.Demonstrations.load`; or the folder of a LeRobot data set, or the name of
             an installed Minari data set.
         metrics: metrics of plans, number by name, see :mod:`ftl_lightning.domains.from_file`; empty for none.
-        validation_share: share of each concept's demonstrations that is held out, at least one.
+        validation_share: share of each concept's demonstrations to hold out, at least a single demonstration.
         seed, batch_size, steps_per_epoch, encoder, revision: see :class:`PretrainingData`; the default encoder is ``'minilm'``
             where it is installed, else ``'hashing'``.
         horizon, start_exponent: see :class:`Windows`.
@@ -283,7 +283,7 @@ class OwnData(PretrainingData):
 
 
 class InversionData(pl.LightningDataModule):
-    """A few demonstrations of each new concept, all learned in the same run.
+    """A few demonstrations of each new concept; all concepts are learned in the same run.
 
     Args:
         domain: name of the domain, or ``package.module:DOMAIN``; ``'own'`` for user data.
@@ -317,19 +317,19 @@ class InversionData(pl.LightningDataModule):
         self.seed = seed
         self.steps = steps
         self.root = None if root is None else Path(root)
-        self.own = demonstrations is not None
+        self.of_user = demonstrations is not None
         self.domain_name = domain if domain == OWN else recorded_name(domain)
         if demonstrations is None and domain == OWN:
             raise UserError("data.demonstrations: expected a file of the new concepts' demonstrations, found none")
         if domain == OWN:
             self.demonstrations = read_own(str(demonstrations))
         else:
-            known = load_domain(domain)
-            require(suite in known.concepts.suites, "data.suite", f"one of {', '.join(known.concepts.suites)}", repr(suite))
+            loaded = load_domain(domain)
+            require(suite in loaded.concepts.suites, "data.suite", f"one of {', '.join(loaded.concepts.suites)}", repr(suite))
             if demonstrations is None:
-                self.demonstrations = self._drawn(known, suite, demonstrations_per_concept)
+                self.demonstrations = self._drawn(loaded, suite, demonstrations_per_concept)
             else:
-                self.demonstrations = read_demonstrations(demonstrations, known)
+                self.demonstrations = read_demonstrations(demonstrations, loaded)
         self.concepts = tuple(dict.fromkeys(self.demonstrations.concepts))
 
     def _drawn(self, domain: Domain, suite: str, count: int) -> Demonstrations:

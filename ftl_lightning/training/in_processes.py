@@ -21,7 +21,7 @@ from ftl_lightning.training.model_folder import load_model
 
 @dataclass(frozen=True)
 class _Share:
-    """Work of one process: file numbers and texts of concepts, and the folder of demonstrations and learned concepts."""
+    """Work of a process: file numbers and texts of concepts, and the folder of demonstrations and learned concepts."""
 
     folder: str
     model: str
@@ -29,7 +29,7 @@ class _Share:
     settings: InversionSettings
     steps: int
     device: str
-    vouched: frozenset[str]
+    trusted: frozenset[str]
 
 
 def learned_in_processes(
@@ -37,24 +37,24 @@ def learned_in_processes(
 ) -> dict[str, Concept]:
     """Learn the concepts of the demonstrations in several processes.
 
-    Equal to a single process up to rounding: sums have other numbers of rows.
+    Results equal those of a single process up to rounding, as batches have other sizes.
 
     Args:
         model: folder or name of the pretrained model.
         device: device to learn on; with several GPUs, processes take them in turn.
         demonstrations: demonstrations; their concept texts name the concepts.
-        processes: maximum number of processes; at most one for each concept.
+        processes: maximum number of processes; never above the number of concepts.
 
     Raises:
         UserError: raised by the learner, or if a process ended early.
     """
     names = tuple(dict.fromkeys(demonstrations.concepts))
     devices = [torch.device("cuda", number) for number in range(torch.cuda.device_count())] if device.type == "cuda" else [device]
-    numbered = tuple(enumerate(names))
+    numbered, trusted = tuple(enumerate(names)), trust.trusted_names()
     with tempfile.TemporaryDirectory() as folder:
         demonstrations.save(Path(folder) / _DEMONSTRATIONS)
         shares = [
-            _Share(folder, model, numbered[first::processes], settings, steps, str(devices[first % len(devices)]), trust.vouched())
+            _Share(folder, model, numbered[first::processes], settings, steps, str(devices[first % len(devices)]), trusted)
             for first in range(min(processes, len(names)))
         ]
         # Spawned, since a forked process would share threads and devices.
@@ -81,12 +81,12 @@ def _learn(share: _Share) -> str:
     """Learn and write a share's concepts; return the message of a ``UserError``, or an empty string."""
     silence()  # the first process has printed all notes
     torch.set_num_threads(1)
-    with trust.vouching(share.vouched):
+    with trust.vouching(share.trusted):
         try:
             model = load_model(share.model).to(share.device)
-            every = Demonstrations.load(Path(share.folder) / _DEMONSTRATIONS)
+            loaded = Demonstrations.load(Path(share.folder) / _DEMONSTRATIONS)
             names = {name for _, name in share.concepts}
-            demonstrations = every.rows([row for row, name in enumerate(every.concepts) if name in names])
+            demonstrations = loaded.rows([row for row, name in enumerate(loaded.concepts) if name in names])
             learned = model.learn_concepts(demonstrations, share.settings, share.steps)
             for number, name in share.concepts:
                 learned[name].save(_file(share.folder, number))

@@ -80,7 +80,7 @@ class InversionModule(Adaptation):
         if "inversion" not in self._modules:
             with torch.device("cpu"):  # with the demonstrations; Lightning moves the parameters afterwards
                 super().configure_model()
-                if self._own:
+                if self._of_user:
                     self.settings = self.settings.for_own(bool(self.model.adaptable()))
                 self.inversion = Inversion(self.model, self.demonstrations, first_settings(self.settings))
 

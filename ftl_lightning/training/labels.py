@@ -8,7 +8,7 @@ from ftl_lightning.igm.settings import ADAPTED, AUTO, MIXED, MODES, InversionSet
 from ftl_lightning.training.method import Method
 
 FORMS = {AUTO: CHOSEN, MODES: WITH_MODES, ADAPTED: WITH_ADAPTER, MIXED: f"{WITH_MODES} {WITH_ADAPTER}"}
-"""Names in tables of the forms that override modes and adapter."""
+"""Names in tables of forms that override modes and adapter."""
 
 
 class Labels(NamedTuple):
@@ -16,7 +16,7 @@ class Labels(NamedTuple):
 
     Attributes:
         method: name of the method.
-        form: form of the concepts; empty for the paper's form, one set of embeddings constant over time.
+        form: form of the concepts; empty for the paper's form, a single set of embeddings constant over time.
         variant: parametrisation of the embeddings and other options, separated by commas.
     """
 
@@ -48,5 +48,5 @@ def labels(method: Method, traits: Sequence[str], settings: InversionSettings, h
     return Labels(
         FINE_TUNED if fine_tuned else method.name,
         "" if fine_tuned else " ".join(word for word in (form, decided) if word),
-        ", ".join([*traits, span, *(text for text, said in parts.items() if said)]),
+        ", ".join([*traits, span, *(text for text, applies in parts.items() if applies)]),
     )

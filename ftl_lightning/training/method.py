@@ -46,7 +46,7 @@ class Method:
         adaptation: the LightningModule of ``invert``, an :class:`~ftl_lightning.training.adaptation.Adaptation`; by default
             gradient descent if the model is invertible, else the model's ``learn``.
         forms: forms of its concepts, in the order in which their names are joined.
-        configurations: folder of configuration files, one for each domain; empty for none.
+        configurations: folder with a configuration file for each domain; empty for none.
         suits: raises a ``UserError`` for an unsupported domain.
     """
 
@@ -72,7 +72,7 @@ class Method:
 def check_present(domain: "Domain") -> None:
     """Refuse domains without observations; ``UserError`` with the domain."""
     reason = f"{domain.name}: there is no present to go on from"
-    require(domain.observed, "domain", "one with observed features", reason)
+    require(domain.observed, "domain", "a domain with observed features", reason)
 
 
 def check_present_or_moment(domain: "Domain") -> None:
@@ -105,7 +105,7 @@ def _ours() -> dict[str, str]:
 
 
 def load_method(name: str) -> Method:
-    """Load a method by name; ``UserError`` for an unknown name or another object."""
+    """Load a method by name; ``UserError`` for an unknown name, or an object that is no method."""
     offered = _ours() if name in SHIPPED else _offered()
     if name not in offered:
         raise UserError(f"method: expected one of {', '.join(method_names())}, found {short(name)!r}")

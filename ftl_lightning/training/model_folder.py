@@ -94,12 +94,12 @@ WEIGHTS = "model.safetensors"
 MOST_PARAMETERS = 10_000
 """Maximum number of parameter tensors in a model from a file."""
 SPARE = 4
-"""Maximum ratio of built numbers to numbers in the file: layers that are stacked afterwards are built twice."""
+"""Maximum ratio of parameters built to parameters in the file: layers that are stacked afterwards are built twice."""
 
 
 @contextmanager
 def at_most(numbers: int) -> Iterator[None]:
-    """Build a network of about ``numbers`` numbers; abort for larger networks.
+    """Within the block, abort the construction of a network much larger than ``numbers`` parameters.
 
     Raises:
         UserError: for a network that is larger or cannot be built.
@@ -124,13 +124,13 @@ def at_most(numbers: int) -> Iterator[None]:
         handle.remove()
 
 
-def check_weights(found: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> None:
+def check_weights(tensors: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> None:
     """Refuse tensors that do not fit a model or are not finite; ``UserError`` with the first such tensor."""
-    for name in [*expected, *found]:
-        if name not in found or name not in expected:
-            message = "expected it, found nothing" if name not in found else "expected nothing, found it"
+    for name in [*expected, *tensors]:
+        if name not in tensors or name not in expected:
+            message = "expected it, found nothing" if name not in tensors else "expected nothing, found it"
             raise UserError(f"does not fit {CONFIG}: key {short(name)!r}: {message}")
-        tensor, like = found[name], expected[name]
+        tensor, like = tensors[name], expected[name]
         if tensor.shape != like.shape or tensor.is_floating_point() != like.is_floating_point():
             kinds = [f"{str(each.dtype).removeprefix('torch.')} {tuple(each.shape)}" for each in (like, tensor)]
             raise UserError(f"does not fit {CONFIG}: key {short(name)!r}: expected {kinds[0]}, found {kinds[1]}")
@@ -139,7 +139,7 @@ def check_weights(found: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -
 
 
 def kinds_for(adapts: Callable[[type[ConceptModel]], bool]) -> list[str]:
-    """Kinds of models whose class has a property."""
+    """Kinds of models whose class satisfies ``adapts``."""
     return [method.kind for method in methods() if method.model and adapts(method.model())]
 
 
@@ -167,9 +167,9 @@ def load_model(folder: str | Path, domain: Domain | str | None = None) -> Concep
 
 
 def find_model(model_hash: str, places: Sequence[Path]) -> Path:
-    """Find the folder of the model with this hash below ``places``; a known domain is preferred; ``UserError`` if there is none.
+    """Find the folder of the model with this hash below ``places``, preferably of a known domain; ``UserError`` if there is none.
 
-    Configurations are read as data; nothing that they name is imported.
+    Configurations are read as data; classes that they name are not imported.
     """
     matches = []
     for path in (path for place in places for path in sorted(place.rglob(CONFIG))):

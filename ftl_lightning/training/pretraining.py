@@ -59,8 +59,8 @@ class Pretraining(pl.LightningModule, ABC, Generic[M]):
             effector's pose with 0.4.
         privileged: loss weights by name: image encoders are trained to predict privileged information of training
             demonstrations, see :class:`~ftl_lightning.domains.domain.Privileged`; none for ``None``.
-        told: share of each step's windows whose image encoding is replaced by privileged information. Such a window costs a
-            fraction of a window with an image.
+        told: share of each step's windows whose image encoding is replaced by privileged information, which costs a fraction of
+            encoding the image.
 
     Raises:
         UserError: at construction, for a value out of its range.
@@ -135,11 +135,11 @@ class Pretraining(pl.LightningModule, ABC, Generic[M]):
 
     def _perturbed_losses(self, model: M, batch: Batch, draw: torch.Generator) -> tuple[Tensor, Batch]:
         states, observed = model.perturbed(batch.states, batch.observed, draw)
-        seen = batch._replace(states=states, observed=dict(observed))
-        return self.losses(model, seen, draw), seen
+        perturbed = batch._replace(states=states, observed=dict(observed))
+        return self.losses(model, perturbed, draw), perturbed
 
     def configure_model(self) -> None:
-        """Build the layers once the data are known, and only once."""
+        """Build the layers, once, when the data are known."""
         if "model" not in self._modules:
             with torch.device("cpu"):  # with the data; Lightning moves the layers afterwards
                 self._configure()
@@ -153,12 +153,12 @@ class Pretraining(pl.LightningModule, ABC, Generic[M]):
         check_different(concepts, embeddings[1:])
         view = find_view(data.domain, self.hparams["view"])
         features = data.domain.observed if view is None else view.features
-        seen: Observed
+        observed: Observed
         if view is None:
-            states, seen = data.training.states, data.training.every_observation
+            states, observed = data.training.states, data.training.every_observation
         else:
             windows = data.every_window()
-            states, seen = windows.states[:, :: self.stride], view.observe(windows.observed)
+            states, observed = windows.states[:, :: self.stride], view.observe(windows.observed)
             states = view.encode(states, windows.observed)
         with torch.device("meta"):  # for its size alone
             image_dim = ImageEncoders(features, self.image_encoder).size
@@ -189,12 +189,12 @@ class Pretraining(pl.LightningModule, ABC, Generic[M]):
             torch.manual_seed(self.seed)
             resolution = data.domain.plans.resolution
             normalization = Normalization.fit(states, view.scales if view else (), resolution, config.plane)
-            beside = None
+            vectors = None
             if config.measured_dim:
-                beside = Normalization.fit(joined_vectors(seen, features), config.entities, resolution)
+                vectors = Normalization.fit(joined_vectors(observed, features), config.entities, resolution)
                 if config.state_columns and (view is None or view.same_columns):  # else plans have another scale
-                    beside.share(config.state_columns, normalization)
-            self.model = self.build(Prepared(config, data.domain, normalization, embeddings, beside), data)
+                    vectors.share(config.state_columns, normalization)
+            self.model = self.build(Prepared(config, data.domain, normalization, embeddings, vectors), data)
             self.model.examples = data.examples
             self.teaching.check_taught(self.domain, self.model.images)
         self.raw = copy.deepcopy(self.model)
@@ -235,11 +235,11 @@ class Pretraining(pl.LightningModule, ABC, Generic[M]):
 
     def _training_loss(self, batch: Batch) -> Tensor:
         draw = generator(self.device, self.seed, self.global_step)
-        looked_at, unseen = self.teaching.apart(self.domain, batch)
-        losses, seen = self._perturbed_losses(self.raw, looked_at, draw)
-        if unseen is not None:
-            states, observed = self.raw.perturbed(unseen.states, unseen.observed, draw)
-            privileged = unseen._replace(states=states, observed=self.teaching.told(self.domain, observed, draw))
+        with_images, without_images = self.teaching.split(self.domain, batch)
+        losses, perturbed = self._perturbed_losses(self.raw, with_images, draw)
+        if without_images is not None:
+            states, observed = self.raw.perturbed(without_images.states, without_images.observed, draw)
+            privileged = without_images._replace(states=states, observed=self.teaching.simulated(self.domain, observed, draw))
             losses = torch.cat((losses, self.losses(self.raw, privileged, draw)))
         loss = losses.mean()
         whole = mean(loss)
@@ -249,7 +249,7 @@ class Pretraining(pl.LightningModule, ABC, Generic[M]):
                 "lower model.learning_rate"
             )
         self.log("train/loss", whole, prog_bar=True)
-        for name, error in self.teaching.errors(self.domain, seen.observed).items():
+        for name, error in self.teaching.errors(self.domain, perturbed.observed).items():
             self.log(f"train/{name}", mean(error))
             loss = loss + self.teaching.weights[name] * error
         return loss if self.unused is None else loss + 0 * self.unused
@@ -260,7 +260,7 @@ class Pretraining(pl.LightningModule, ABC, Generic[M]):
         decay = min(self.hparams["ema_decay"], self.global_step / (self.global_step + 10))
         if self.unused is None:
             with torch.no_grad():
-                # No public name: one call for all parameters instead of one for each.
+                # No public name: a single call for all parameters.
                 torch._foreach_lerp_(list(self.model.parameters()), list(self.raw.parameters()), 1 - decay)
 
     def _evaluation_step(self, batch: Batch, name: str) -> None:
@@ -346,8 +346,8 @@ class Pretraining(pl.LightningModule, ABC, Generic[M]):
 
     def signature(self) -> dict[str, Any]:
         """Configuration that decides the shapes and meaning of a checkpoint's parameters."""
-        different = ("training", "training_concepts", "perturb", "metrics", "feature_dropout")
-        config = {key: value for key, value in asdict(self.model.config).items() if key not in different}
+        excluded = ("training", "training_concepts", "perturb", "metrics", "feature_dropout")
+        config = {key: value for key, value in asdict(self.model.config).items() if key not in excluded}
         return {"module_class": type(self).__name__, **config}
 
 
@@ -371,7 +371,7 @@ def check_shown(concepts: Sequence[str], shown: Sequence[str]) -> None:
 
 
 def check_different(concepts: Sequence[str], embeddings: Tensor) -> None:
-    """Refuse concepts with equal text embeddings, such as texts that differ in capitals alone.
+    """Refuse concepts with equal text embeddings, such as texts that differ only in capitals.
 
     Raises:
         UserError: with two such concepts.

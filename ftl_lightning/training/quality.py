@@ -30,7 +30,7 @@ def right_plans(measured: Mapping[str, Tensor]) -> tuple[str, Tensor] | None:
 
 
 def judging_domain(model: ConceptModel, examples: Sequence[Demonstrations]) -> Domain:
-    """A model's domain; for a user's data, including demonstrations of learned concepts."""
+    """Domain that judges a model's samples: the model's; for user data, extended by demonstrations of learned concepts."""
     if model.examples is None:
         return model.domain
     config = model.config
@@ -50,7 +50,7 @@ def judged(domain: Domain, plans: Demonstrations, goal: str) -> dict[str, float]
 
 
 def picture(domain: Domain, plans: Demonstrations, goal: str = "") -> "Figure":
-    """Draw plans; with a goal, right plans are framed green and wrong plans red.
+    """Draw plans; with a goal, correct plans are framed green, wrong plans red.
 
     Raises:
         UserError: for a goal that the domain cannot judge.
@@ -99,14 +99,14 @@ class Inspection:
         """Figure of demonstrations above samples."""
         shown = slice(0, SHOWN)
         observed = bool(self.domain.observed)
-        known = self.starts.take(slice(0, len(self.demonstrations))) if observed else None  # initial states of samples, in turn
-        demonstrations = Drawn("demonstrations", self.demonstrations, known)
+        starts = self.starts.take(slice(0, len(self.demonstrations))) if observed else None  # initial states of samples, in turn
+        demonstrations = Drawn("demonstrations", self.demonstrations, starts)
         samples = Drawn("samples", self.samples[shown], self.starts.take(shown) if observed else None)
         return beside(self.domain.show, demonstrations, samples, f"{self.name}: {self}")
 
 
 def inspected(model: ConceptModel, domain: Domain, demonstrations: Demonstrations, concept: Concept) -> Inspection | None:
-    """Inspect samples of a learned concept, with the same noise for every seed of learning.
+    """Sample a learned concept, with the same noise for every seed of learning, and measure quality and success.
 
     Args:
         domain: domain whose first success metric judges samples, if it can read the concept's name.

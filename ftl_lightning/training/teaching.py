@@ -22,7 +22,7 @@ class Teaching:
         share: share of each step's windows without encoded images.
 
     Raises:
-        UserError: for a weight or share out of its range, or a share without exactly one name.
+        UserError: for a weight or share out of its range, or a share with several names or none.
     """
 
     def __init__(self, weights: Mapping[str, float], share: float) -> None:
@@ -36,14 +36,14 @@ class Teaching:
     def check_taught(self, domain: Domain, images: ImageEncoders | None) -> None:
         """Refuse names that the domain does not provide or the encoder of ``images`` cannot predict."""
         for name in self.weights:
-            known = domain.recordings.privileged.get(name)
-            if known is None or images is None:
+            privileged = domain.recordings.privileged.get(name)
+            if privileged is None or images is None:
                 names = ", ".join(domain.recordings.privileged) if images is not None else "none, as no image is observed"
                 raise UserError(f"model.privileged: expected {names or 'none'} (domain {domain.name}), found {short(name)!r}")
-            place, expected = f"model.privileged.{name}", f"image_encoder of {known.feature.shape[0]} points"
-            require(images.size == known.feature.size, place, expected, f"one that reads {images.size} numbers")
-            tells = not self.share or known.told is not None
-            require(tells, "model.told", f"0, as nothing tells what is read of {name!r}", self.share)
+            place, expected = f"model.privileged.{name}", f"image_encoder of {privileged.feature.shape[0]} points"
+            require(images.size == privileged.feature.size, place, expected, f"{images.size} outputs")
+            possible = not self.share or privileged.told is not None
+            require(possible, "model.told", f"0, as the domain does not simulate encodings of {name!r}", self.share)
 
     def attach(self, images: ImageEncoders | None) -> None:
         """Keep the outputs of image encoders."""
@@ -54,22 +54,22 @@ class Teaching:
         self._read = read
 
     def errors(self, domain: Domain, observed: Observed) -> dict[str, Tensor]:
-        """Mean errors of the last image encodings by name."""
+        """Mean prediction error of the last image encodings, by name."""
         return {name: domain.recordings.privileged[name].error(self._read, observed[name]).mean() for name in self.weights}
 
-    def apart(self, domain: Domain, batch: Batch) -> tuple[Batch, Batch | None]:
-        """Split a batch into windows with encoded images, at least one, and windows without images."""
+    def split(self, domain: Domain, batch: Batch) -> tuple[Batch, Batch | None]:
+        """Split a batch into windows with encoded images (not empty) and windows without images."""
         count = max(1, round((1 - self.share) * len(batch.states)))
         if count >= len(batch.states):
             return batch, None
         images = [name for name, feature in domain.observed.items() if feature.kind == "image"]
-        unseen = {name: values[count:] for name, values in batch.observed.items() if name not in images}
+        vectors = {name: values[count:] for name, values in batch.observed.items() if name not in images}
         first = Batch(batch.states[:count], batch.concepts[:count], take(batch.observed, slice(count)))
-        return first, Batch(batch.states[count:], batch.concepts[count:], unseen)
+        return first, Batch(batch.states[count:], batch.concepts[count:], vectors)
 
-    def told(self, domain: Domain, observed: Observed, draw: torch.Generator) -> dict[str, Tensor]:
+    def simulated(self, domain: Domain, observed: Observed, draw: torch.Generator) -> dict[str, Tensor]:
         """Add simulated image encodings to the observations of windows without images."""
         (name,) = self.weights
-        tell = domain.recordings.privileged[name].told
-        assert tell is not None
-        return {**observed, READ: tell(observed[name], draw)}
+        simulate = domain.recordings.privileged[name].told
+        assert simulate is not None
+        return {**observed, READ: simulate(observed[name], draw)}

@@ -1,4 +1,4 @@
-"""Lightning's trainer with the additional verb ``invert``, on one device or in several processes by DDP."""
+"""Lightning's trainer with the additional verb ``invert``, on a single device or in several processes by DDP."""
 
 import inspect
 import math
@@ -44,7 +44,7 @@ NUMBERS = {
     "sync_batchnorm",
     "use_distributed_sampler",
 }
-"""Options that can change the numbers of a run on one device."""
+"""Options that can change the results of a run on a single device."""
 USUAL = {"max_epochs": 1, "deterministic": True}
 """Defaults of the shipped configurations of ``invert`` that differ from Lightning's."""
 LEAST = {
@@ -69,7 +69,7 @@ class LostProcess(UserError):
 
 @contextmanager
 def one_voice() -> Iterator[None]:
-    """Silence a process that another process started, within the block; its errors are a line, or none if another one ended."""
+    """Silence a process that another process started; its errors are a line, or none after :class:`LostProcess`."""
     if not getattr(rank_zero_only, "rank", 0):
         yield
         return
@@ -129,8 +129,8 @@ class Trainer(pl.Trainer):
             raise UserError(f"trainer: {short(str(error), 200)}") from error
         if isinstance(self.accelerator, CPUAccelerator):
             check_range("trainer.devices", self.num_devices, 1, os.cpu_count() or 1)
-        known = inspect.signature(pl.Trainer.__init__).parameters
-        usual = {name: parameter.default for name, parameter in known.items()} | USUAL
+        parameters = inspect.signature(pl.Trainer.__init__).parameters
+        usual = {name: parameter.default for name, parameter in parameters.items()} | USUAL
         self.unusual = {
             name: value if isinstance(value, int | float | str | None) else type(value).__name__
             for name, value in options.items()
@@ -141,7 +141,7 @@ class Trainer(pl.Trainer):
             self.strategy.checkpoint_io = WholeCheckpoints()
 
     def check_alone(self, verb: str) -> None:
-        """Refuse several processes for a verb that runs in one process; ``UserError`` naming the verb."""
+        """Refuse several processes for a single-process verb; ``UserError`` naming the verb."""
         instead = "use trainer.processes" if verb == "invert" else "`fit` alone runs on several"
         processes = self.num_devices * self.num_nodes
         require(processes == 1, "trainer.devices", f"1 for {verb}", f"{processes}; {instead}")
@@ -169,13 +169,13 @@ class Trainer(pl.Trainer):
         _expect_monitors(self)
 
     def validate(self, *arguments: Any, **options: Any) -> Any:
-        """Lightning's ``validate``, in one process."""
+        """Lightning's ``validate``, in a single process."""
         self.check_alone("validate")
         with self._restoring():
             return super().validate(*arguments, **options)
 
     def test(self, *arguments: Any, **options: Any) -> Any:
-        """Lightning's ``test``, in one process."""
+        """Lightning's ``test``, in a single process."""
         self.check_alone(self.verb if self.verb == "invert" else "test")
         with self._restoring():
             return super().test(*arguments, **options)
@@ -189,7 +189,7 @@ class Trainer(pl.Trainer):
 
     @contextmanager
     def _restoring(self) -> Iterator[None]:
-        """Report errors of Lightning and torch about a checkpoint that cannot be restored, in one line."""
+        """Convert errors of Lightning and torch while restoring a checkpoint to a ``UserError``."""
         try:
             yield
         except UserError:

@@ -25,8 +25,8 @@ from ftl_lightning.domains.tabletop.interface import (
     PUSH_ON_BOOK,
     RAISED,
     VIEWS,
-    misplaced,
-    told,
+    keypoint_loss,
+    noisy_keypoints,
 )
 from ftl_lightning.methods.ftl_igm.pretraining import PretrainingModule
 from ftl_lightning.networks.image_encoder import ImageEncoders
@@ -99,7 +99,7 @@ def test_eyes_are_taught_places(tmp_path: Path) -> None:
     read = model.of_images(start.observed)
     assert read is not None
     assert read.shape == (len(data.training), 20)
-    assert float(misplaced(read, start.observed[PLACES]).mean()) < losses[0]
+    assert float(keypoint_loss(read, start.observed[PLACES]).mean()) < losses[0]
 
 
 def test_an_error_is_that_of_what_is_seen() -> None:
@@ -109,14 +109,14 @@ def test_an_error_is_that_of_what_is_seen() -> None:
     right[:, 0, 0], right[:, 2, 0] = 0.1 / HALF, 0.015 / HALF
     right[:, 3] = torch.tensor([20.0, *[-20.0] * 4])
     right[:, :3, 1:] = 7.0  # nobody knows where what is not seen is
-    assert misplaced(right.flatten(1), places).tolist() == pytest.approx([0, 0], abs=1e-6)
+    assert keypoint_loss(right.flatten(1), places).tolist() == pytest.approx([0, 0], abs=1e-6)
     right[1, 1, 0] += 0.5
-    assert misplaced(right.flatten(1), places).tolist() == pytest.approx([0, 0.5], abs=1e-6)
+    assert keypoint_loss(right.flatten(1), places).tolist() == pytest.approx([0, 0.5], abs=1e-6)
 
 
-def test_what_is_told_is_right_but_for_errors_of_eyes(data: PretrainingData) -> None:
+def test_noisy_keypoints_are_near_the_true_places(data: PretrainingData) -> None:
     places = data.batch(0).observed[PLACES].repeat(200, 1, 1)
-    read = told(places, generator("cpu", 0))
+    read = noisy_keypoints(places, generator("cpu", 0))
     there = places[..., 0] > 0.5
     wrong = read.unflatten(1, (4, 5)).transpose(1, 2)[..., :3] * HALF - (places[..., 1:] - torch.tensor([*MIDDLE, 0.0]))
     assert wrong[there].std(dim=0).tolist() == pytest.approx(list(BLUR), rel=0.1)
@@ -169,9 +169,9 @@ def test_places_move_with_the_picture_and_what_has_none_is_also_seen_higher(data
         torch.testing.assert_close(moved - before, heights[:, None].expand_as(moved), atol=1e-6, rtol=0)
 
 
-def test_mistakes_are_told_in_one_line(data: PretrainingData) -> None:
+def test_invalid_options_are_refused(data: PretrainingData) -> None:
     plain = {"image_encoder": {"origin": "origin"}}
-    reads = "model.privileged.places: expected image_encoder of 5 points, found one that reads 96 numbers"
+    reads = "model.privileged.places: expected image_encoder of 5 points, found 96 outputs"
     for options, message in (
         ({"privileged": {"depth": 1.0}}, r"model.privileged: expected places \(domain tabletop\), found 'depth'"),
         ({"privileged": {PLACES: 1.0}, "denoiser_args": {}, **plain}, reads),

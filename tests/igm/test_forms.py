@@ -87,7 +87,7 @@ def test_concepts_of_one_knot_compose_with_those_of_several_and_others_are_refus
     other = noise(network, Composition(still.embeddings.repeat(1, 3, 1), still.weights) + moving)
     assert torch.equal(noise(network, both), other)
     four = Composition(normal(1, 4, 4), torch.ones(1))
-    with pytest.raises(UserError, match="expected concepts of one number of knots \\(or of one knot\\), found 3 and 4"):
+    with pytest.raises(UserError, match="expected concepts with equal numbers of knots \\(or 1 knot\\), found 3 and 4"):
         moving + four
     together, own = batched([still, moving], 2, [torch.Generator(), torch.Generator()])
     assert together.embeddings.shape == (2, 1, 3, 4)
@@ -171,7 +171,7 @@ def test_an_adapter_that_changes_everything_is_another_network(network: Temporal
     each, rows = batched([WALK, adapted(WAVE, change)], 1, [torch.Generator(), torch.Generator()])
     sample = composed_epsilon(network, X[:2], T[:2], each, EMPTY, network.observe(PLACE[:2]), rows)
     assert torch.allclose(sample[0], noise(network, WALK)[0], atol=1e-4)
-    with pytest.raises(UserError, match="expected at most one concept whose adapter changes the whole network, found two"):
+    with pytest.raises(UserError, match="expected at most 1 concept whose adapter changes the whole network, found 2"):
         adapted(WAVE, change) + adapted(WALK, change)
 
 

@@ -204,7 +204,7 @@ def test_a_concept_decides_which_points_matter() -> None:
 
 
 def test_points_have_to_be_read_of_images_and_a_name_that_is_no_encoder_is_refused() -> None:
-    with pytest.raises(UserError, match=r"initial_encoder: expected flat, found points: no points are read of images"):
+    with pytest.raises(UserError, match=r"initial_encoder: expected flat, found points: the image encoder has no head of points"):
         condition_encoder("points", Sizes(4, 1, 2, {OBSERVED: FEATURE}), 8)
     with pytest.raises(UserError, match=r"denoiser_args.initial_encoder: expected points without a plane"):
         TemporalUNet(replace(of_points(), horizon=8), initial_encoder="points")

@@ -27,7 +27,7 @@ MOST_RUNS = 2  #: Maximum runs of a cell, so that a cell that crashes machines d
 
 @contextmanager
 def cluster(address: str, attempt: Attempt, cells: Sequence[Cell] = ()) -> Iterator[Run]:
-    """Connect to a Ray cluster for the length of the block; an existing connection is used and stays open. Raise UserError if Ray
+    """Connect to a Ray cluster within the block; an existing connection is used and stays open. Raise UserError if Ray
     is missing, no cluster answers, or a cell fits on no machine.
 
     Args:
@@ -56,7 +56,7 @@ def cluster(address: str, attempt: Attempt, cells: Sequence[Cell] = ()) -> Itera
 def _connect(address: str) -> None:
     import ray
 
-    expected = "HOST:PORT of a cluster's head, and ablate called on one of its machines, in a folder that all of them share"
+    expected = "HOST:PORT of a cluster's head, and ablate called on a machine of the cluster, in a folder that all machines share"
     require("://" not in address, "address", expected, short(address))
     here = _here() if address in ("", "auto") else ""
     expected = "a Ray cluster that this machine is a node of"
@@ -120,7 +120,7 @@ def _run(attempt: Attempt, cells: Sequence[Cell], known: set[str], tell: Tell) -
         def send(cell: Cell, runs: int) -> None:
             begun = Path(folder, str(next(numbers)))
             remote_cell = remote.options(name=cell.folder, **cell.resources.ray())
-            task = remote_cell.remote(str(Path.cwd()), cell, known, trust.vouched(), attempt, str(begun), runs > 1)
+            task = remote_cell.remote(str(Path.cwd()), cell, known, trust.trusted_names(), attempt, str(begun), runs > 1)
             waiting[task] = _Sent(cell, runs, begun)
 
         numbers = itertools.count()
@@ -193,7 +193,7 @@ def _without_home(waiting: dict[Any, _Sent], now: float) -> Iterator[tuple[Cell,
 
 
 def _attempt_in(
-    folder: str, cell: Cell, known: set[str], vouched: frozenset[str], attempt: Attempt, begun: str, again: bool
+    folder: str, cell: Cell, known: set[str], trusted: frozenset[str], attempt: Attempt, begun: str, again: bool
 ) -> Outcome:
     """Run a cell in the shared folder of a cluster, with the modules that the user vouches for."""
     import ray
@@ -205,5 +205,5 @@ def _attempt_in(
     os.chdir(folder)
     os.environ["TORCH_FORCE_WEIGHTS_ONLY_LOAD"] = "1"  # as on the command line; checkpoints may be read
     write_text(begun, node)
-    with trust.vouching(vouched):
+    with trust.vouching(trusted):
         return replace(attempt(cell, known, again), node=node)

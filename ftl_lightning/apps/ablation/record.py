@@ -1,4 +1,4 @@
-"""States of cells: a file beside the results, written by all shards; its table; and the estimated cost of a grid."""
+"""States of cells in a file beside the results, written by all shards; their table; estimated cost of a grid."""
 
 import heapq
 import json
@@ -27,14 +27,12 @@ MINUTE, HOUR = 60.0, 3600.0
 _SEED = re.compile(r", seed \d+$")
 
 State = Literal["queued", "running", "again", "done", "failed"]
-"""State of a cell; ``again`` is queued once more, after its process or machine was lost."""
+"""State of a cell; ``again`` is queued a second time, after the loss of its process or machine."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Rows of a cell (or ``None``), a short note, the error of a failed cell in one line, seconds (0 if nothing was run), and
-    machine.
-    """
+    """Result of a cell: rows (or ``None``), note, single-line error if it failed, seconds (0 if nothing was run), and machine."""
 
     rows: "pd.DataFrame | None" = None
     note: str = ""
@@ -47,7 +45,7 @@ Tell = Callable[[Cell, State, str, str], None]  #: Callback for a new state of a
 Run = Callable[[Sequence[Cell], set[str], Tell], Iterator[tuple[Cell, Outcome]]]
 """Runs cells, given the configuration hashes that need not run; yields each cell with its outcome."""
 Attempt = Callable[[Cell, set[str], bool], Outcome]
-"""Runs a cell, unless its configuration hash is known; the flag says whether it was lost before."""
+"""Runs a cell, unless its configuration hash is known; the flag marks a second attempt."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +81,7 @@ def read_record(results: str | Path) -> dict[str, CellRecord]:
 
 
 def tell(results: str | Path, cells: Sequence[Cell], state: State, node: str = "", note: str = "", seconds: float = 0.0) -> None:
-    """Record a state of cells; an empty node and 0 seconds keep the known values. Other processes are locked out."""
+    """Record a state of cells; an empty node and 0 seconds keep the recorded values. Processes write in turn."""
     path = record_path(results)
     with alone(path.parent):
         entries = read_record(results)
@@ -103,15 +101,15 @@ def tell(results: str | Path, cells: Sequence[Cell], state: State, node: str = "
 
 def table(entries: Mapping[str, CellRecord], cells: Sequence[Cell]) -> Table:
     """Table of cells with state, machine, runs, seconds, and outcome or error; cells without an entry were never started."""
-    known = {cell.name: entries.get(cell.name, CellRecord()) for cell in cells}
-    shown = Table(title=count_states([entry.state for entry in known.values()]))
+    records = {cell.name: entries.get(cell.name, CellRecord()) for cell in cells}
+    states_table = Table(title=count_states([entry.state for entry in records.values()]))
     for name in ("cell", "state", "node", "runs", "seconds", "note"):
-        shown.add_column(name, justify="right" if name in ("runs", "seconds") else "left")
-    for name, entry in known.items():
+        states_table.add_column(name, justify="right" if name in ("runs", "seconds") else "left")
+    for name, entry in records.items():
         seconds = f"{entry.seconds:.0f}" if entry.seconds else ""
         runs = str(entry.runs or "")
-        shown.add_row(*(literal(text) for text in (name, entry.state, entry.node, runs, seconds, short(entry.note, 100))))
-    return shown
+        states_table.add_row(*(literal(text) for text in (name, entry.state, entry.node, runs, seconds, short(entry.note, 100))))
+    return states_table
 
 
 def count_states(states: Sequence[str]) -> str:
@@ -122,10 +120,10 @@ def count_states(states: Sequence[str]) -> str:
 
 
 def by_node(entries: Mapping[str, CellRecord], cells: Sequence[Cell]) -> list[str]:
-    """Counts of cells by state, in a line for each machine."""
-    known = [entries[cell.name] for cell in cells if cell.name in entries]
-    nodes = sorted({entry.node for entry in known if entry.node})
-    return [f"{node}: {count_states([entry.state for entry in known if entry.node == node])}" for node in nodes]
+    """Lines with the number of cells by state, for each machine."""
+    records = [entries[cell.name] for cell in cells if cell.name in entries]
+    nodes = sorted({entry.node for entry in records if entry.node})
+    return [f"{node}: {count_states([entry.state for entry in records if entry.node == node])}" for node in nodes]
 
 
 def seconds_of(cell: Cell, entries: Mapping[str, CellRecord]) -> float | None:
@@ -143,7 +141,7 @@ def seconds_of(cell: Cell, entries: Mapping[str, CellRecord]) -> float | None:
 
 
 def makespan(seconds: Sequence[Sequence[float]], workers: int) -> float:
-    """Total seconds of consecutive stages, given the durations of their cells, when the next cell goes to the first free worker."""
+    """Total seconds of consecutive stages from the durations of their cells; the first free worker takes the next cell."""
     total = 0.0
     for stage in seconds:
         free = [0.0] * workers
@@ -166,7 +164,7 @@ def estimate(plan: Sequence[Sequence[Cell]], entries: Mapping[str, CellRecord], 
     unknown = [cell.name for stage in times for cell, seconds in stage if seconds is None]
     count = len(cells) - len(unknown)
     if not count:
-        return [*lines, "hours: not known, as no cell like them was measured; run one, for example with --shard, and ask again"]
+        return [*lines, "hours: not known, as no similar cell was measured; run some, for example with --shard, and ask again"]
     if unknown:
         lines.append(
             f"not known: {len(unknown)} of them, without a similar measured cell, such as {unknown[0]}; their time is added"

@@ -30,14 +30,14 @@ if TYPE_CHECKING:
 
 
 def check(cells: Sequence[Cell]) -> None:
-    """Check files, keys and encoder of each cell and, for ``invert``, domain, suites and model. Raise UserError with all mistakes
-    in one line; nothing was started.
+    """Check files, keys and encoder of each cell and, for ``invert``, domain, suites and model, before any cell starts. Raise
+    UserError with all mistakes.
     """
-    made = {cell.options["model.output"] for cell in cells if cell.verb == "fit" and "model.output" in cell.options}
+    outputs = {cell.options["model.output"] for cell in cells if cell.verb == "fit" and "model.output" in cell.options}
     mistakes = {}
     for cell in cells:
         try:
-            _check(cell, made)
+            _check(cell, outputs)
         except (UserError, ArgumentError) as error:
             mistakes[cell.command] = " ".join(str(error).split())
     if mistakes:
@@ -73,8 +73,8 @@ def _check(cell: Cell, made: set[str]) -> None:
         network = model_class(trained["kind"])
         fitting = trained["domain"] == domain.name and network is not None and adaptation_class.adapts(network)
         expected = f"a model of {domain.name} ({' or '.join(kinds_for(adaptation_class.adapts))})"
-        found = f"one of {trained['domain']} ({trained['kind']}) in {model['pretrained']}"
-        require(fitting, "model.pretrained", expected, found)
+        actual = f"one of {trained['domain']} ({trained['kind']}) in {model['pretrained']}"
+        require(fitting, "model.pretrained", expected, actual)
     if "encoder" in model:
         load_encoder(model["encoder"], domain.concepts.table, model["revision"])
 
@@ -88,7 +88,7 @@ def run_ablation(
     Args:
         plan: cells of each stage, in order; a stage may read files of earlier stages.
         results: results file.
-        executor: ``'local'`` runs cells one by one in this process; ``'ray'`` in parallel on a cluster whose machines share this
+        executor: ``'local'`` runs cells in turn in this process; ``'ray'`` in parallel on a cluster whose machines share this
             folder. A cell that loses its process or machine runs once more.
         address: address of the Ray cluster, see :func:`~ftl_lightning.apps.ablation.cluster.cluster`.
     """
@@ -168,8 +168,8 @@ def show_estimate(plan: Sequence[Sequence[Cell]], results: str, workers: int = 0
             advance()
             return not _is_done(cell, known)
 
-        left = [[cell for cell in cells if needed(cell)] for cells in plan]
-    say("\n".join(estimate(left, read_record(results), total, workers)))
+        to_run = [[cell for cell in cells if needed(cell)] for cells in plan]
+    say("\n".join(estimate(to_run, read_record(results), total, workers)))
 
 
 def _is_made(cell: Cell) -> bool:

@@ -36,13 +36,13 @@ class Wave:
 def waves(plan: Mapping[int, Sequence[Cell]]) -> list[Wave]:
     """Group stages by number: a group begins when a cell reads an output of the previous group, such as a pretrained model."""
     groups: list[list[int]] = []
-    made: set[str] = set()
+    outputs: set[str] = set()
     for number, cells in plan.items():
-        if not groups or any(_reads(cell, made) for cell in cells):
+        if not groups or any(_reads(cell, outputs) for cell in cells):
             groups.append([])
-            made = set()
+            outputs = set()
         groups[-1].append(number)
-        made |= {cell.options["model.output"] for cell in cells if "model.output" in cell.options}
+        outputs |= {cell.options["model.output"] for cell in cells if "model.output" in cell.options}
     grouped = [Wave(tuple(group), tuple(cell for number in group for cell in plan[number])) for group in groups]
     return [wave for wave in grouped if wave.cells]
 
@@ -65,7 +65,7 @@ def script(wave: Wave, plan: Path, folder: Path, jobs: int = 0, options: Mapping
     name = re.sub(r"[^\w.-]+", "_", Path(plan.stem).stem)
     lines = {"job-name": name, "array": f"1-{jobs}", "ntasks": "1", _CPUS: f"{cpus}", **_booked(wave.cells), **_checked(options)}
     header = [f"#SBATCH --{name}={value}" if value else f"#SBATCH --{name}" for name, value in lines.items()]
-    trusted = [word for name in sorted(trust.vouched()) for word in (trust.OPTION, name)]
+    trusted = [word for name in sorted(trust.trusted_names()) for word in (trust.OPTION, name)]
     only = f"[{', '.join(map(str, wave.numbers))}]"
     command = [sys.executable, "-m", "ftl_lightning", "ablate", "--config", str(plan), "--only", only, *trusted]
     body = [

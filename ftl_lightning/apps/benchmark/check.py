@@ -34,8 +34,8 @@ def check_submission(path: Path) -> tuple[Submission, dict[str, BenchmarkSuite]]
         _check_header(submission)
         suites = {name: load_suite(name) for name in submission.suites}
         for name, suite in suites.items():
-            given = submission.suites[name]
-            require(given == suite.hash, f"suites.{short(name)}", f"the frozen suite's hash {suite.hash}", short(given))
+            recorded = submission.suites[name]
+            require(recorded == suite.hash, f"suites.{short(name)}", f"the frozen suite's hash {suite.hash}", short(recorded))
         runs: dict[tuple[str, int], Run] = {}
         for index, run in enumerate(submission.runs):
             key, where = f"runs[{index}]", f"{run.suite}, seed {run.seed}"
@@ -122,9 +122,9 @@ def drawn(submission: Submission, share: float, salt: str) -> list[Run]:
     """
     file_hash = submission.hash
     order = sorted(submission.runs, key=lambda run: content_hash([salt, file_hash, run.suite, run.seed]))
-    least = share * sum(len(run.rows) for run in submission.runs)
+    minimum = share * sum(len(run.rows) for run in submission.runs)
     runs: list[Run] = []
-    while sum(len(run.rows) for run in runs) < least:
+    while sum(len(run.rows) for run in runs) < minimum:
         runs.append(order[len(runs)])
     return runs
 
@@ -187,7 +187,7 @@ def recompute(
             # Given models default to the shipped models.
             model = SHIPPED if run.origin == GIVEN and not candidate.model else candidate.model
             again = replace(candidate, model=model, work=Path(work)).run(suites[run.suite], run.seed)
-            found = list(differences(run, again, suites[run.suite], alike))
-            say(f"{run.suite}, seed {run.seed}: {f'{len(found)} numbers differ' if found else 'the same'}")
-            all_differences += found
+            differing = list(differences(run, again, suites[run.suite], alike))
+            say(f"{run.suite}, seed {run.seed}: {f'{len(differing)} numbers differ' if differing else 'the same'}")
+            all_differences += differing
     return all_differences

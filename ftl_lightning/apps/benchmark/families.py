@@ -1,7 +1,7 @@
 """Four families of behaviour that resemble user data: no simulator, no initial states, concepts that are words or numbers.
 
-Each family is a domain. Kinds of pictures, reaches and beats are defined by a number. A sample is right if the nearest of many
-samples of all kinds belongs to the goal.
+Each family is a domain. A number defines a kind of pictures, reaches or beats. A sample is correct if its nearest neighbour among
+many samples of all kinds is of the goal's kind.
 """
 
 import itertools
@@ -38,8 +38,8 @@ def _number(kind: str) -> int:
 
 def pictures(kind: str, count: int, seed: int) -> NDArray[np.float32]:
     """Pictures of polylines with three to five corners, drawn with a soft pen: ``(count, 1, 64)``. A state has 8 x 8 grey values
-    from 0 to 16, row by row. The kind ``'picture NUMBER'`` determines the corners, the seed slant, size, place and width of each
-    picture.
+    from 0 to 16, row by row. The kind ``'picture NUMBER'`` determines the corners; the seed determines slant, size, place and width
+    of each picture.
     """
     rng, shape = _rng("pictures", kind, seed), _rng("picture", _number(kind))
     corner = shape.uniform(0.12, 0.88, (int(shape.integers(3, 6)), 2))
@@ -50,20 +50,20 @@ def pictures(kind: str, count: int, seed: int) -> NDArray[np.float32]:
         angle, slant, middle = rng.uniform(-0.2, 0.2), rng.uniform(-0.25, 0.25), points.mean(axis=0)
         change = np.array(((np.cos(angle), -np.sin(angle)), (np.sin(angle), np.cos(angle)))) @ np.array(((1, slant), (0, 1)))
         points = (points - middle) @ (change * rng.uniform(0.85, 1.1)).T + middle + rng.normal(0, 0.03, 2)
-        width, far = rng.uniform(0.05, 0.1), np.full(len(pixels), 9.0)
+        width, distance = rng.uniform(0.05, 0.1), np.full(len(pixels), 9.0)
         for start, end in itertools.pairwise(points):
-            way = end - start
-            along = np.clip(((pixels - start) @ way) / (way @ way + 1e-9), 0, 1)
-            far = np.minimum(far, np.linalg.norm(pixels - start - along[:, None] * way, axis=1))
-        grey = np.clip(1.3 - 0.6 * far / width, 0, 1).reshape(8, 4, 8, 4).mean(axis=(1, 3))
+            segment = end - start
+            along = np.clip(((pixels - start) @ segment) / (segment @ segment + 1e-9), 0, 1)
+            distance = np.minimum(distance, np.linalg.norm(pixels - start - along[:, None] * segment, axis=1))
+        grey = np.clip(1.3 - 0.6 * distance / width, 0, 1).reshape(8, 4, 8, 4).mean(axis=(1, 3))
         drawn.append(np.round(16 * np.clip(1.2 * grey, 0, 1)).reshape(1, 64))
     return np.asarray(drawn, dtype=np.float32)
 
 
 def reaches(kind: str, count: int, seed: int) -> NDArray[np.float32]:
-    """Reaches of a hand through three places, with a gripper that closes on the way: ``(count, 50, 4)``. Columns are x, y and z in
-    metres, mostly within 0.6 of the origin, and the opening from 0 to 80 mm. The kind ``'reach NUMBER'`` determines the places and
-    when the gripper closes, the seed start and deviations of each reach.
+    """Hand trajectories through three waypoints, with a gripper that closes on the way: ``(count, 50, 4)``. Columns are x, y and z
+    in metres, mostly within 0.6 of the origin, and the opening from 0 to 80 mm. The kind ``'reach NUMBER'`` determines waypoints
+    and time of closing; the seed determines start and deviations of each trajectory.
     """
     shape, rng, s, drawn = _rng("a reach", _number(kind)), _rng("reaches", kind, seed), np.linspace(0, 1, 50), []
     goals, closing, height = shape.uniform(-0.4, 0.4, (3, 3)), shape.uniform(0.2, 0.8), shape.uniform(0.05, 0.3)
@@ -71,17 +71,17 @@ def reaches(kind: str, count: int, seed: int) -> NDArray[np.float32]:
         start, places = rng.normal(0, 0.05, 3), goals + rng.normal(0, 0.03, goals.shape)
         knots = np.stack((start, *places))
         smooth = s * s * (3 - 2 * s)
-        way = np.stack([np.interp(smooth, np.linspace(0, 1, 4), knots[:, axis]) for axis in range(3)], axis=-1)
-        way = np.stack([np.convolve(np.pad(column, 4, mode="edge"), np.ones(9) / 9, mode="valid") for column in way.T], axis=-1)
-        way[:, 2] += height * np.sin(np.pi * s)
+        path = np.stack([np.interp(smooth, np.linspace(0, 1, 4), knots[:, axis]) for axis in range(3)], axis=-1)
+        path = np.stack([np.convolve(np.pad(column, 4, mode="edge"), np.ones(9) / 9, mode="valid") for column in path.T], axis=-1)
+        path[:, 2] += height * np.sin(np.pi * s)
         grip = 1 / (1 + np.exp(-(s - closing - rng.uniform(-0.05, 0.05)) * 40))
-        drawn.append(np.column_stack((way + rng.normal(0, 0.001, way.shape), 80 * grip)))
+        drawn.append(np.column_stack((path + rng.normal(0, 0.001, path.shape), 80 * grip)))
     return np.asarray(drawn, dtype=np.float32)
 
 
 def beats(kind: str, count: int, seed: int) -> NDArray[np.float32]:
-    """Beats of one column, four waves over a wandering line: ``(count, 120, 1)``, in millivolts, mostly within 3 of zero. The kind
-    ``'beat NUMBER'`` determines the waves, the seed pace, size and wandering of each beat.
+    """Heartbeats of four waves on a drifting baseline: ``(count, 120, 1)``, in millivolts, mostly within 3 of zero. The kind
+    ``'beat NUMBER'`` determines the waves; the seed determines pace, size and drift of each beat.
     """
     shape, rng, s, drawn = _rng("a beat", _number(kind)), _rng("beats", kind, seed), np.linspace(0, 1, 120), []
     place, width, height = np.sort(shape.uniform(0.1, 0.9, 4)), shape.uniform(0.015, 0.08, 4), shape.normal(0, 1, 4)
@@ -103,10 +103,10 @@ class Nearest:
     @cached_property
     def _templates(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Templates ``(kind * template, time * column)`` in units of their spread, and the spread ``(column,)``."""
-        known = np.concatenate([self.draw(kind, TEMPLATES, TEMPLATE_SEED) for kind in self.kinds]).astype(np.float64)
+        templates = np.concatenate([self.draw(kind, TEMPLATES, TEMPLATE_SEED) for kind in self.kinds]).astype(np.float64)
         # Columns of single states share a scale, as some are constant.
-        scale = known.reshape(-1, known.shape[2]).std(axis=0) if known.shape[1] > 1 else np.ones(known.shape[2])
-        return (known / scale).reshape(len(known), -1), scale
+        scale = templates.reshape(-1, templates.shape[2]).std(axis=0) if templates.shape[1] > 1 else np.ones(templates.shape[2])
+        return (templates / scale).reshape(len(templates), -1), scale
 
     def __call__(self, samples: NDArray[np.float32]) -> Sequence[str]:
         """The kind of each sample ``(sample, time, column)``; empty for non-finite samples."""

@@ -42,16 +42,16 @@ def read_submissions(folder: Path) -> list[Submission]:
     """Submissions of a folder by name. Raise UserError for an invalid file, two submissions of a method, or an empty folder."""
     files = visible(folder, "*.json") if folder.is_dir() else []
     require(files, str(folder), "a folder of submissions (.json)", "none")
-    known: dict[str, Submission] = {}
+    by_name: dict[str, Submission] = {}
     for path in files:
         submission, _ = check_submission(path)
-        require(submission.name not in known, str(path), f"one submission of {submission.name!r}", "two; remove one")
-        known[submission.name] = submission
-    return [known[name] for name in sorted(known)]
+        require(submission.name not in by_name, str(path), f"one submission of {submission.name!r}", "two; remove one")
+        by_name[submission.name] = submission
+    return [by_name[name] for name in sorted(by_name)]
 
 
 def leaderboard(submissions: Sequence[Submission]) -> str:
-    """The page, in Markdown."""
+    """Leaderboard page in Markdown."""
     suites = [load_suite(name) for name in suite_names()]
     chosen = [suite for suite in suites if any(suite.name in entry.suites for entry in submissions)]
     parts = [HEAD, BEGIN, *(_section(suite, submissions) for suite in chosen)]

@@ -163,10 +163,10 @@ _SHAPES = SHAPES | _OPEN | _CLOSED | _VALIDATION | _TEST
 
 
 def strokes(kind: str, count: int, seed: int) -> NDArray[np.float32]:
-    """Strokes of one kind with different size, proportions, place, slant and pace, and a slight tremble.
+    """Strokes of a kind with different size, proportions, place, slant and pace, and a slight tremble.
 
     Args:
-        kind: one of :data:`TRAINING` or :data:`NEW`.
+        kind: from :data:`TRAINING` or :data:`NEW`.
         count, seed: number of strokes, and random seed; strokes are equal on every machine up to rounding.
 
     Returns:
@@ -201,18 +201,18 @@ def _scribbles(even: Points, rng: np.random.Generator) -> Points:
 
 
 def drawn(kind: str, count: int, seed: int, alike: float = 0.0) -> NDArray[np.float32]:
-    """Hand-drawn strokes of one kind, as of :func:`strokes`: ``(count, 40, 2)``.
+    """Strokes of a kind as drawn by hand: ``(count, 40, 2)``, in the units of :func:`strokes`.
 
     Args:
-        kind: one of :data:`KNOWN`, :data:`VALIDATION` or :data:`TEST`, also after :data:`MIRRORED` or :data:`BACKWARDS`; or
-            :data:`RANDOM`.
-        alike: 0 for strokes of many people, all over the canvas; up to 1 for one person's strokes at the same place, which differ
-            in bending and trembling.
+        kind: from :data:`KNOWN`, :data:`VALIDATION` or :data:`TEST`, optionally prefixed by :data:`MIRRORED` or
+            :data:`BACKWARDS`; or :data:`RANDOM`.
+        alike: similarity of the strokes, from 0 (many people, all over the canvas) to 1 (the same person and place; strokes differ
+            in bending and tremble).
     """
     rng = np.random.default_rng([seed, task_key(kind)])
     plain = kind.removeprefix(MIRRORED).removeprefix(BACKWARDS)
     free = 1 - alike
-    person = rng.uniform(-1, 1, 6) * alike  # common to all strokes of one person
+    person = rng.uniform(-1, 1, 6) * alike  # common to all strokes of a person
 
     def varied(width: float, part: int) -> Points:
         return width * (person[part] + free * rng.uniform(-1, 1, count))
@@ -263,7 +263,7 @@ class Judge:
 
     @classmethod
     def of(cls, kinds: tuple[str, ...] = (*KNOWN, *VALIDATION, *TEST), count: int = TEMPLATES) -> "Judge":
-        """Create a classifier of some kinds with ``count`` templates each."""
+        """Create a classifier of ``kinds`` with ``count`` templates each."""
         return cls(kinds, np.concatenate([_normalised(drawn(kind, count, TEMPLATE_SEED)) for kind in kinds]))
 
     def _distances(self, strokes: NDArray[np.float32]) -> Points:

@@ -42,7 +42,7 @@ CHANGES: Mapping[str, Handler] = {"forget": (requests.Named, Workspace.forget), 
 
 
 class Desk:
-    """Workspaces of the opened models. Requests are handled in the current workspace, one at a time.
+    """Workspaces of the opened models. Requests are handled in the current workspace, in turn.
 
     Args:
         models, make: names of models that can be opened, the initial model first; and creates the workspace of a model, in a
@@ -57,7 +57,7 @@ class Desk:
         self.ended = threading.Event()
 
     async def work(self, do: Callable[[Workspace], Any]) -> Any:
-        """Call a function with the current workspace, in a thread. Raise HTTPException if too many requests are pending."""
+        """Call a function of the current workspace in a thread. Raise HTTPException if too many requests are pending."""
         if self._waiting >= MOST_WAITING:
             raise HTTPException(429, "too many questions at a time; wait for an answer")
         self._waiting += 1
@@ -73,7 +73,7 @@ class Desk:
         return self._opened[model]
 
     def open(self, model: str) -> dict[str, Any]:
-        """Switch to another model, and keep the workspace of the previous. Raise UserError for a model that cannot be opened."""
+        """Switch to another model; workspaces of earlier models are kept. Raise UserError for a model that cannot be opened."""
         require(model in self._models, "model", f"one of {', '.join(self._models)}", short(model))
         workspace = self._workspace(model)
         self._current = model

@@ -69,25 +69,25 @@ class Demonstrating:
                 for row in finding.rows:
                     flags.setdefault(row, []).append(finding.text)
                 general += [] if finding.rows else [finding.text]
-        shown = [
+        entries = [
             {"id": number, "film": films(self._domain, entry)[0], "flags": flags.get(row, [])}
             for row, (number, entry) in enumerate(self._entries.items())
         ]
-        return {"demonstrations": shown, "check": general, "undo": bool(self._before), "wanted": WANTED}
+        return {"demonstrations": entries, "check": general, "undo": bool(self._before), "wanted": WANTED}
 
     def together(self, name: str) -> Demonstrations:
-        """All demonstrations as those of a concept; at least one is required."""
+        """Demonstrations joined under the concept ``name``. Raise UserError if there are none."""
         require(self._entries, "demonstrations", "one or more", "none; show the model something first")
         joined = concatenate(list(self._entries.values()))
         return replace(joined, concepts=(name,) * len(joined))
 
     def _recorder(self) -> Recorder:
         if (recorder := self._domain.recordings.recorder) is None:
-            raise UserError(f"scene: expected a model whose behaviour is shown by hand, found one of {self._domain.name}")
+            raise UserError(f"scene: expected a model whose behaviour is shown by hand, found {self._domain.name}")
         return recorder
 
     def scene(self, request: requests.Pose) -> Json:
-        """Draw a new scene. Raise UserError in a domain without recording by hand, or for a task without scenes."""
+        """Draw a new scene to record in. Raise UserError in a domain without a recorder, or for a task without scenes."""
         recorder = self._recorder()
         expected = f"one of {len(recorder.tasks)} whose scenes can be drawn"
         require(not request.task or request.task in recorder.tasks, "task", expected, short(request.task))
@@ -108,7 +108,7 @@ class Demonstrating:
         self.add(recorder.record(scene, *check_path(scene, request.path, request.seconds)))
 
     def draw(self, request: requests.Drawn) -> None:
-        """Add demonstrations of the library: an expert's, or recordings. Raise UserError for a task without demonstrations."""
+        """Add demonstrations of a task from the domain's expert or recordings. Raise UserError for a task without any."""
         self._domain.check_goal(request.task, "task")
         self._count += 1
         self.add(self._source.draw(request.task, request.count, self._count))

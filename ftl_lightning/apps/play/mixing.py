@@ -1,4 +1,4 @@
-"""Films as JSON for the page: of demonstrations, and of samples of mixed concepts, judged where the domain can judge."""
+"""Films as JSON for the page: demonstrations, and samples of mixed concepts, judged if the domain has metrics."""
 
 import functools
 import operator
@@ -50,8 +50,8 @@ def sampling_of(model: FewShot, temperature: float | None = None) -> dict[str, A
 
 
 def starts_of(model: FewShot, tasks: Sequence[str], count: int, seed: int) -> tuple[str, InitialStates | None]:
-    """Initial states, and their task, the first that the domain reads; neither without observations. Raise UserError if none is
-    read.
+    """Task and initial states, of the first task that the domain reads; empty without observations. Raise UserError if there is no
+    such task.
     """
     if not model.domain.observed:
         return "", None
@@ -62,13 +62,13 @@ def starts_of(model: FewShot, tasks: Sequence[str], count: int, seed: int) -> tu
 
 
 def goal_of(domain: Domain, names: Sequence[str], task: str) -> str:
-    """Goal of a mixture: the joined names if the domain reads them, else the requested task; empty if samples cannot be judged."""
+    """Goal by which a mixture is judged: the joined names if the domain reads them, else the requested task; empty for none."""
     reads = domain.concepts.reads
     return next((text for text in (JOINED.join(names), task) if text and reads(text)), "")
 
 
 def judge_of(model: FewShot, examples: Sequence[Demonstrations]) -> Domain:
-    """Domain that judges samples: of a user's data, with demonstrations of new concepts beside those of training."""
+    """Domain that judges samples; for user data, by demonstrations of training and new concepts."""
     base = model.model.examples
     return judging_domain(model.model, [*([] if base is None else [base]), *examples])
 
@@ -95,16 +95,16 @@ def samples(model: FewShot, mixture: Mixture, asked: Sample, tasks: Sequence[str
     goal = goal_of(judge, mixture.names, asked.task)
     if not asked.execute:
         plans = model.sample(mixture.mixed, asked.count, starts, seed=asked.seed, **how)
-        shown, verdict = judged(judge, plans, goal)
+        played, verdict = judged(judge, plans, goal)
     elif starts is None:
-        raise UserError(f"execute: expected a model whose behaviour is executed, found one of {model.domain.name}")
+        raise UserError(f"execute: expected a model whose behaviour is executed, found {model.domain.name}")
     else:
         done = model.execute(mixture.mixed, starts, goal, seed=asked.seed, **how)
         outcomes: Mapping[str, Tensor] = model.domain.judge(goal, done.rollout) if goal else {}
-        shown = episode_films(model.domain, done.rollout, outcomes)
+        played = episode_films(model.domain, done.rollout, outcomes)
         verdict = ", ".join(f"{name} {value:.2f}" for name, value in done.outcomes.items())
         verdict = f"mean of {asked.count}: {verdict} ({goal})" if verdict else ""
-    return shown, verdict, Sampled(count=asked.count, seed=asked.seed, task=task, execute=asked.execute, **how)
+    return played, verdict, Sampled(count=asked.count, seed=asked.seed, task=task, execute=asked.execute, **how)
 
 
 def film(drawn: VectorFilm, right: bool | None = None, outcome: str = "") -> Json:
@@ -144,10 +144,10 @@ def episode_films(domain: Domain, rollout: Rollout, outcomes: Mapping[str, Tenso
         return []
     succeeded = outcomes.get(SUCCESS)
     booleans = {name: values for name, values in outcomes.items() if values.dtype == torch.bool}
-    shown = []
+    episodes = []
     for episode in range(len(rollout.failed)):
         words = ", ".join(name for name, values in booleans.items() if values[episode])
         words = words or (f"no {SUCCESS}" if SUCCESS in booleans else "")
         right = None if succeeded is None else bool(succeeded[episode])
-        shown.append(film(draw(rollout.take(episode, episode + 1)), right, words))
-    return shown
+        episodes.append(film(draw(rollout.take(episode, episode + 1)), right, words))
+    return episodes

@@ -60,8 +60,8 @@ def page(nonce: str, offline: bytes | None = None) -> str:
 
 
 def request_key(path: str, body: Any = None) -> str:
-    """Key of a request among precomputed answers, as the page computes it: path and query, then the body of a POST with keys in the
-    page's order and whole numbers without a point, as in JavaScript.
+    """Key of a request to a precomputed answer, equal to the page's: path and query, then the JSON body of a POST, formatted as by
+    JavaScript.
     """
     if body is None:
         return path
@@ -83,8 +83,7 @@ def pairs_of(concepts: Sequence[dict[str, Any]], named: Sequence[tuple[str, str]
     if named:
         by_name = {concept["name"]: concept["id"] for concept in concepts}
         for name in itertools.chain(*named):
-            found = f"{short(name)!r}; the verb concepts lists them"
-            require(name in by_name, "pairs", "concepts of the model", found)
+            require(name in by_name, "pairs", "concepts of the model", f"{short(name)!r}; the verb concepts lists them")
         return [(by_name[first], by_name[second]) for first, second in named]
     learned = [concept["id"] for concept in concepts if concept["kind"] != "training"]
     training = [concept["id"] for concept in concepts if concept["kind"] == "training"]
@@ -100,8 +99,8 @@ def answers_of(
     """Answers to all requests of the page by request key, see :func:`pairs_of`; ``tell`` is called after each mixture."""
     state = workspace.state()
     mixes = pairs_of(state["concepts"], pairs)
-    shown = set(itertools.chain(*mixes))
-    concepts = [concept for concept in state["concepts"] if concept["id"] in shown]
+    identifiers = set(itertools.chain(*mixes))
+    concepts = [concept for concept in state["concepts"] if concept["id"] in identifiers]
     offline = {"weights": list(WEIGHTS), "pairs": [list(pair) for pair in mixes]}
     answers: dict[str, Any] = {"/api/state": state | {"concepts": concepts, "models": [], "offline": offline}}
     for concept in concepts:
@@ -156,8 +155,8 @@ def viewed(file: str, model: str = "") -> dict[str, Any]:
 
 
 def _state(title: str, notes: list[str], groups: list[Json]) -> dict[str, Any]:
-    shown = {"title": title, "told": notes, "groups": groups}
-    return {"title": title, "model": {"name": "", "title": "", "hash": ""}, "models": [], "viewer": shown, "offline": None}
+    viewer = {"title": title, "told": notes, "groups": groups}
+    return {"title": title, "model": {"name": "", "title": "", "hash": ""}, "models": [], "viewer": viewer, "offline": None}
 
 
 def _of_demonstrations(file: str) -> tuple[list[str], list[Json]]:

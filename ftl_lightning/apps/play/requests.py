@@ -93,7 +93,7 @@ class Learn:
 
 @dataclass(frozen=True)
 class Mixed:
-    """A concept of a mixture, by its identifier on the page, with a factor of its weight, on some groups of columns or all."""
+    """Term of a mixture: identifier of a concept on the page, factor of its weight, and groups of columns (empty for all)."""
 
     id: str
     weight: float = 1.0

@@ -1,4 +1,4 @@
-"""Python code and commands that reproduce the results of the page, with equal numbers."""
+"""Python code and commands that reproduce the page's results exactly."""
 
 import keyword
 import re
@@ -17,8 +17,8 @@ VARIABLES = frozenset({"model", "mixed", "starts", "samples", "episodes", *keywo
 
 @dataclass(frozen=True)
 class Learned:
-    """A concept learned on the page: name during learning, which determines where learning starts; current name; settings that
-    differ from the model's; and gradient steps, ``None`` for the tuned number.
+    """A concept learned on the page: name during learning, a key of the initial embedding; current name; settings that differ from
+    the model's; and gradient steps, ``None`` for the tuned number.
     """
 
     name: str
@@ -34,19 +34,19 @@ class Learned:
 
     @property
     def file(self) -> str:
-        """Name of the concept's file downloaded from the page."""
+        """File name of the concept when downloaded from the page."""
         return f"{self.variable}.safetensors"
 
     @property
     def demonstrations(self) -> str:
-        """Name of the demonstrations' file downloaded from the page."""
+        """File name of the demonstrations when downloaded from the page."""
         return f"{self.variable}.npz"
 
 
 @dataclass(frozen=True)
 class Part:
-    """A term of a mixture: text of a training concept or name of a learned one, factor of its weight, groups of columns (empty for
-    all), how it was learned here, or the file of a concept from elsewhere.
+    """Term of a mixture: text or name of a concept, factor of its weight, and groups of columns (empty for all); ``learned`` for a
+    concept of this page, ``file`` for other learned concepts.
     """
 
     text: str
@@ -112,7 +112,7 @@ def _term(part: Part) -> str:
 
 
 def composed(parts: Sequence[Part]) -> str:
-    """Text for ``--compose``."""
+    """Value of ``--compose``."""
     terms = []
     for part in parts:
         name = f"{FOLDER}/{file_name(part.learned.name)}.safetensors" if part.learned else part.file or part.text
@@ -122,7 +122,7 @@ def composed(parts: Sequence[Part]) -> str:
 
 
 def command(model: str, configuration: str, parts: Sequence[Part], how: Sampled | None) -> str:
-    """Shell commands that do the same as :func:`python`; ``configuration`` is the file of ``invert`` for the model."""
+    """Shell commands equivalent to :func:`python`; ``configuration`` is the file of ``invert`` for the model."""
     lines = []
     for entry in {part.learned.variable: part.learned for part in parts if part.learned}.values():
         words = ["python", "-m", "ftl_lightning", "invert", "--config", configuration, "--model.pretrained", model]

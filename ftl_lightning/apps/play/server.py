@@ -53,7 +53,7 @@ MISTAKES = (
     TypeError,
     ValueError,
 )
-"""Exceptions that are reported in one line. Starlette handles the class Exception outside of the guard, which adds headers."""
+"""Exceptions reported on a single line. Not Exception, which Starlette handles outside of :class:`Guard` and so without headers."""
 Begin = Callable[[], Awaitable[Any]]  # called at the start, while requests are already answered
 
 
@@ -91,8 +91,8 @@ class Guard:
             if origin.lower().removeprefix("http://") not in self._hosts:
                 return f"origin: expected http://{min(self._hosts)}, found {short(origin)}"
         first = request.scope["path"] == "/"
-        given = request.query_params.getlist("token") if first else request.headers.getlist(TOKEN)
-        if len(given) != 1 or not hmac.compare_digest(given[0].encode(), self._token.encode()):
+        tokens = request.query_params.getlist("token") if first else request.headers.getlist(TOKEN)
+        if len(tokens) != 1 or not hmac.compare_digest(tokens[0].encode(), self._token.encode()):
             return "token: expected that of the address which the program printed, found another; open that address"
         return None
 
@@ -141,7 +141,7 @@ def guarded(
 
 
 def message_of(error: Exception) -> str:
-    """Message of an error for the user; failures of the program are printed as well."""
+    """Message of an error for the user; bugs of the program are also printed."""
     if isinstance(error, UserError):
         return line(str(error))
     if (message := mistake_of_machine(error)) is not None:
@@ -172,7 +172,7 @@ class Place:
 
 
 def serve(routes: Sequence[Route], place: Place, begin: Begin | None = None, close: Callable[[], None] = lambda: None) -> None:
-    """Serve a page until Ctrl-C or its end, then call ``close``. Raise UserError if the address is not available."""
+    """Serve a page until Ctrl-C or its request to end, then call ``close``. Raise UserError if the address is not available."""
     listening = _listening(place.host, place.port)
     port, names, token = listening.getsockname()[1], _names(place.host), secrets.token_urlsafe(24)
     hosts = [f"{name}:{port}" for name in names]

@@ -50,7 +50,7 @@ class Known:
     Attributes:
         name, kind: text, and ``'training'``; ``'shipped'`` or ``'saved'`` in the model's library; ``'opened'`` from a file;
             ``'learned'`` here.
-        concept, file: content, and path or name of the concept's file; none for training concepts, no path for those learned here.
+        concept, file: content, and path or name of the concept's file; empty for training concepts.
         learned, demonstrations: how the concept was learned here, and from what; else ``None``.
         accuracy: fraction of correct samples; ``None`` if not judged.
     """
@@ -297,7 +297,7 @@ class Workspace:
         return judged(judge, plans, goal_of(judge, (concept.concept.origin.name,), task))
 
     def thumbnail(self, key: str) -> Json:
-        """Film of one sample of a concept."""
+        """Film of a sample of a concept."""
         known = self._known(key)
         _, starts = starts_of(self._model, (known.name, self._demonstrating.task), 1, 0)
         plans = self._model.sample(known.composition, 1, starts, seed=0, **sampling_of(self._model))

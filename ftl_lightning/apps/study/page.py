@@ -89,8 +89,8 @@ def _keep_other_keys(path: Path, study: str) -> None:
             existing = read_json(path).get("study")
         except (UserError, OSError, AttributeError):
             existing = "something else"
-        found = f"that of {short(str(existing))}; name another folder with --out"
-        require(existing == study, str(path), "no key of another study", found)
+        actual = f"that of {short(str(existing))}; name another folder with --out"
+        require(existing == study, str(path), "no key of another study", actual)
 
 
 def _drawings(domain: Domain, questions: Questions) -> dict[str, Any]:

@@ -47,8 +47,9 @@ class Film:
 
     Attributes:
         setting: :data:`TRAINING` or :data:`NEW`, or another name from a listing.
-        scenario: unit of comparison between methods: a concept from one initial state.
-        concept, method: text shown to raters, and method that generated the behaviour, or one of :data:`CHECKS`.
+        scenario: unit of comparison between methods: a concept and an initial state.
+        concept: text shown to raters.
+        method: method that generated the behaviour, or a key of :data:`CHECKS`.
         states: ``(time, state)`` in the domain's units.
         file, row, hash: source of the behaviour, and hash of the file.
     """
@@ -91,8 +92,8 @@ def read_films(folder: Path, domain: Domain, scenarios: int, seed: int) -> list[
         elif entry.method in CHECKS:
             rows = [0]
         else:
-            where, found = f"{folder / entry.file}: of {concept!r}", f"{available[concept]}; see --scenarios"
-            require(available[concept] >= scenarios, where, f"{scenarios} samples or more in every method's file", found)
+            where, actual = f"{folder / entry.file}: of {concept!r}", f"{available[concept]}; see --scenarios"
+            require(available[concept] >= scenarios, where, f"{scenarios} samples or more in every method's file", actual)
             rows = sorted(np.random.default_rng(seed).permutation(available[concept])[:scenarios].tolist())
         for row in rows:
             require(row < len(source), f"{listing}: key 'row' of {entry.file}", f"0 to {len(source) - 1}", row)
@@ -159,7 +160,7 @@ class Questions:
     """A study's films, in the order of their numbers, and questions.
 
     Attributes:
-        still: numbers of films that are shown as their first state only.
+        still: numbers of films of which only the first state is shown.
         page: questions on the page: ``{"id", "text", "films"}``, a single film for yes or no, several films to choose from.
         key, shown: meaning of each question, and source of each film, by id.
     """
@@ -178,9 +179,9 @@ def film_id(number: int) -> str:
 
 
 def ask(films: Sequence[Film], repeats: int, still: int, seed: int) -> Questions:
-    """Ask whether each film depicts its concept, which film of a scenario depicts it best, and checks: ``repeats`` questions are
-    asked twice, and ``still`` films are repeated as a standing picture, which depicts no motion. Films are one of each method in
-    every scenario, and checks; ``seed`` determines numbers, and repeated and standing films.
+    """Ask whether each film depicts its concept, and which film of a scenario depicts it best. As checks, ``repeats`` questions are
+    asked twice, and ``still`` films are repeated as still pictures, which depict no motion. ``films`` has a film of each method in
+    every scenario, and checks; ``seed`` determines the numbering, and the repeated and still films.
     """
     rng = np.random.default_rng(seed)
     real = [film for film in films if film.method not in CHECKS]
@@ -227,7 +228,7 @@ def ask(films: Sequence[Film], repeats: int, still: int, seed: int) -> Questions
 
 
 def whether(concept: str) -> str:
-    """Text of the first question."""
+    """Text of the question whether a film depicts a concept."""
     return f"Does this film depict “{line(concept)}”?"
 
 

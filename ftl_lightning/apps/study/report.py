@@ -43,7 +43,7 @@ class Question:
 
 @dataclass(frozen=True)
 class FilmSource:
-    """Source of a film; ``still`` for a film that is shown as its first state only."""
+    """Source of a film; ``still`` if only its first state is shown."""
 
     setting: str
     scenario: str
@@ -113,8 +113,8 @@ def read_rater(path: Path, key: Key) -> Rater:
     """Read a file of answers. Raise UserError if it is missing, damaged, of another study or page, or not finished."""
     content = _json(path, ANSWERS_KIND)
     for part, expected in (("study", key.study), ("page", key.page)):
-        found = f"{shown(content.get(part))}; the answers are of another {part}"
-        require(content.get(part) == expected, f"{path}: key {part!r}", expected, found)
+        actual = f"{shown(content.get(part))}; the answers are of another {part}"
+        require(content.get(part) == expected, f"{path}: key {part!r}", expected, actual)
     name, given = content.get("rater"), content.get("answers")
     if not isinstance(name, str) or not name or not isinstance(given, list):
         raise UserError(f"{path}: expected a rater and a list of answers, found a damaged file")
@@ -136,7 +136,7 @@ def read_rater(path: Path, key: Key) -> Rater:
 
 
 def read_raters(paths: Sequence[Path], key: Key) -> tuple[list[Rater], list[str]]:
-    """Read files, or folders with files ``answers*.json``: unique raters, and one line for each refused file."""
+    """Read raters from files, or folders with files ``answers*.json``; also a line for each refused file."""
     files: list[Path] = []
     refused: list[str] = []
     for path in paths:
@@ -172,15 +172,14 @@ def inattention(rater: Rater, key: Key) -> str:
 
 
 def krippendorff_alpha(units: Iterable[Sequence[Hashable]]) -> float:
-    """Krippendorff's alpha of categories without an order: 1 for full agreement, 0 for agreement by chance, negative for less. ``1
-    - D_observed / D_expected``, see K. Krippendorff, "Computing Krippendorff's Alpha-Reliability", 2011, part C and D. Each unit
-    has the categories given by raters; fewer than two do not count. NaN if nothing varies: agreement is then indistinguishable from
-    habit.
+    """Krippendorff's alpha of categories without an order: 1 for full agreement, 0 for chance, negative below chance.
+    ``1 - D_observed / D_expected``, see K. Krippendorff, "Computing Krippendorff's Alpha-Reliability", 2011, part C and D. A unit
+    has the raters' categories; units with fewer than two are ignored. NaN if all categories are equal.
     """
     paired = [Counter(unit) for unit in units if len(unit) > 1]
     totals = sum(paired, Counter())
     count = totals.total()
-    # Pairs within a unit that differ, each unit with a weight that makes every value count once.
+    # Pairs within a unit that differ, weighted so that every value counts once.
     observed = sum((u.total() ** 2 - sum(n * n for n in u.values())) / (u.total() - 1) for u in paired)
     expected = count**2 - sum(n * n for n in totals.values())
     return 1 - (count - 1) * observed / expected if expected else math.nan
@@ -188,7 +187,7 @@ def krippendorff_alpha(units: Iterable[Sequence[Hashable]]) -> float:
 
 @dataclass(frozen=True)
 class Share:
-    """How often raters chose a method in a setting, in per cent.
+    """Percentage of answers in a setting for a method.
 
     Attributes:
         mean: mean over raters and scenarios.
@@ -208,10 +207,10 @@ class Report:
     """Results of a study.
 
     Attributes:
-        shares, agreement: by setting, question and method; and Krippendorff's alpha by setting and question.
+        shares: share of answers for a method, by setting, question and method.
+        agreement: Krippendorff's alpha by setting and question.
         scenarios, raters: number of scenarios by setting, and of raters whose answers count.
-        dropped, refused: one line for every inattentive rater, and for every file that does not have finished answers to this
-            study.
+        dropped, refused: lines about inattentive raters, and about files without finished answers to this study.
     """
 
     shares: Mapping[tuple[str, str, str], Share]
@@ -227,7 +226,7 @@ class Report:
         return sorted({method for _, _, method in self.shares})
 
     def table(self) -> Table:
-        """One row for each setting and question, one column for each method."""
+        """Table with a row per setting and question and a column per method."""
         scenarios = ", ".join(f"{count} {setting}" for setting, count in self.scenarios.items())
         raters = "1 rater" if self.raters == 1 else f"{self.raters} raters"
         table = Table(
@@ -250,8 +249,8 @@ def _cell(share: Share) -> str:
 
 
 def study_table(answers: Sequence[Path], key: Path, keep_all: bool = False) -> Report:
-    """The table of a study's answers, in files or in folders of ``answers*.json``; with ``keep_all``, raters who failed attention
-    checks count. Raise UserError for a key that cannot be read, and if no rater is left, with the first reason.
+    """Evaluate a study's answers, in files or in folders of ``answers*.json``; ``keep_all`` includes raters who failed attention
+    checks. Raise UserError for a key that cannot be read, and if no rater is left, with the first reason.
     """
     known = read_key(key)
     raters, refused = read_raters(answers, known)

@@ -1,4 +1,4 @@
-"""Formats of demonstrations. Each module registers its formats when it is imported; a new format is one more module here."""
+"""Formats of demonstrations. Each module registers its formats on import; a new format is a new module."""
 
 from ftl_lightning.data.formats import files, lerobot, minari
 

@@ -77,7 +77,7 @@ def from_episodes(episodes: Sequence[Episode], given: Metadata) -> Contents:
     """Invert :func:`to_episodes`, padding to the longest with the last state; attributes are not validated.
 
     Args:
-        episodes: at least one, all with the same columns and observed features.
+        episodes: episodes with the same columns and observed features; not empty.
         given: attributes stored beside the episodes; features that were not read are ignored.
 
     Raises:

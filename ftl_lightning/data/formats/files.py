@@ -41,7 +41,7 @@ Tell = Callable[[], None]
 
 
 def write_safetensors(demonstrations: Demonstrations, name: str) -> None:
-    """Write a safetensors file, whole or not at all; the same demonstrations give the same bytes."""
+    """Write a safetensors file atomically; the same demonstrations give the same bytes."""
     tensors = demonstrations.tensors
     images = {key: values for key, values in tensors.items() if values.dtype == torch.uint8}
     header = {**_header(demonstrations), "provenance": dict(demonstrations.provenance)}
@@ -62,7 +62,7 @@ def read_safetensors(name: str) -> Contents:
 
 
 def write_npz(demonstrations: Demonstrations, name: str) -> None:
-    """Write an ``.npz`` file without compression and without provenance, whole or not at all."""
+    """Write an ``.npz`` file without compression and without provenance, atomically."""
     arrays: dict[str, Any] = {key: values.detach().cpu().numpy() for key, values in demonstrations.tensors.items()}
     arrays |= {key: np.array(value, dtype=np.str_) for key, value in _header(demonstrations).items()}
     with atomic(name) as temporary, temporary.open("wb") as file:
@@ -84,7 +84,7 @@ def read_npz(name: str) -> Contents:
         "".join(text for array in arrays.values() if array.dtype.kind == "U" for text in np.ravel(array)).encode()
     except _DAMAGED as error:
         message = short(str(error), 100)
-        raise UserError(f"{path}: expected an .npz of plain arrays, found a damaged one or one with objects ({message})") from error
+        raise UserError(f"{path}: expected an .npz of plain arrays, found a damaged file or Python objects ({message})") from error
     tensors: dict[str, Tensor] = {}
     header: dict[str, Any] = {}
     with about(path):
@@ -160,7 +160,7 @@ def _decompressed(key: str, packed: Tensor | None, shape: tuple[int, ...], leadi
         check_unpacked(size, len(packed), "images")
     reader = zlib.decompressobj()
     try:
-        content = bytearray(reader.decompress(packed.numpy().tobytes(), size + 1))  # one more, to reach the end
+        content = bytearray(reader.decompress(packed.numpy().tobytes(), size + 1))  # a byte more, to reach the end
     except zlib.error as error:
         raise UserError(f"{place}: expected compressed images, found damaged bytes ({error}); take another copy") from error
     longer = len(content) > size or bool(reader.unused_data)

@@ -89,14 +89,14 @@ def _contents(folder: str | Path, part: str = "", observed: Sequence[str] | None
     with about(root):
         part = _part(features, part)
         names = _observed(features, part, observed)
-    given, written = Metadata(), (root / METADATA).is_file()
+    metadata, written = Metadata(), (root / METADATA).is_file()
     if written:
         content = read_json(root / METADATA)
         with about(root / METADATA):
-            given = from_mapping(Metadata, content, "")
+            metadata = from_mapping(Metadata, content, "")
     if part != STATE:  # names and units are those of the states that were written
-        given = replace(given, state_names=None, state_units=None)
-    given = replace(given, state_names=given.state_names or features[part].names)
+        metadata = replace(metadata, state_names=None, state_units=None)
+    metadata = replace(metadata, state_names=metadata.state_names or features[part].names)
     if images := short(", ".join(key for key, feature in features.items() if feature.dtype in ("image", "video")), 150):
         say(line(f"{root}: left out {images}: images and videos are not read"), error=True)
     scene = [SCENE] if written and SCENE in features else []
@@ -119,7 +119,7 @@ def _contents(folder: str | Path, part: str = "", observed: Sequence[str] | None
             )
         )
     with about(root):
-        contents = from_episodes(read, given)
+        contents = from_episodes(read, metadata)
     return {**contents, "provenance": contents["provenance"] or {"lerobot": root.resolve().name}}
 
 
@@ -210,7 +210,7 @@ def _by_number(path: Path, number: str, value: str, kind: type) -> dict[int, Any
 
 
 def write_lerobot(demonstrations: Demonstrations, folder: str | Path, fps: int = 10) -> None:
-    """Write a data set for LeRobot and :func:`read_lerobot`, whole or not at all.
+    """Write a data set for LeRobot and :func:`read_lerobot`, atomically.
 
     Demonstrations have no actions. The action of a frame is the next state, of the last frame its state, as for a robot controlled
     by positions. Scenes and features known only at the start are repeated in each frame.

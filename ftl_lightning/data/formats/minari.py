@@ -1,8 +1,8 @@
 """Minari data sets. Needs the extra ``minari``.
 
-An episode is a demonstration. Its states are the flattened observations. If an observation is a dictionary, one part holds the
+An episode is a demonstration. Its states are the flattened observations. If an observation is a dictionary, a part holds the
 states, and its other vectors are observed features that are known at every time. A demonstration's text is the first ``concept`` in
-the episode's ``infos`` (of its first step, if there is one for each step), the episode's metadata, or the data set's metadata; by
+the episode's ``infos`` (of its first step, if they are per step), the episode's metadata, or the data set's metadata; by
 default, the data set's name.
 
 Metadata of the data set hold what Minari cannot: the domain, names and units of columns, names of features that are known only at
@@ -57,11 +57,11 @@ def _contents(name: str, part: str = "", observed: Sequence[str] | None = None) 
         attributes = dataset.storage.metadata
         written = _HEADER in attributes
         with about(name):
-            given = from_mapping(Metadata, attributes.get(_HEADER, {}), _HEADER)
+            metadata = from_mapping(Metadata, attributes.get(_HEADER, {}), _HEADER)
             part = states_part(dataset.observation_space, part)
             features = feature_parts(dataset.observation_space, part, observed, images=written)
         if part not in ("", PART):  # names and units are those of the states that were written
-            given = replace(given, state_names=None, state_units=None)
+            metadata = replace(metadata, state_names=None, state_units=None)
         texts = [_text(entry) for entry in dataset.storage.get_episode_metadata(dataset.episode_indices)]
         texts = [text or _text(attributes) or name for text in texts]
         episodes = [_episode(episode, part, features, text, written) for episode, text in zip(dataset, texts, strict=True)]
@@ -72,7 +72,7 @@ def _contents(name: str, part: str = "", observed: Sequence[str] | None = None) 
         message = short(str(error), 100)
         raise UserError(f"{name}: expected a Minari data set, found a damaged or foreign one ({message})") from error
     with about(name):
-        contents = from_episodes(episodes, given)
+        contents = from_episodes(episodes, metadata)
     return {**contents, "provenance": contents["provenance"] or {"minari": name}}
 
 

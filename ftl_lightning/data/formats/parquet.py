@@ -28,14 +28,14 @@ def read_columns(
 
     Args:
         root, pattern: folder, and pattern of its files.
-        shapes: shape of a row of each column, by name; a shape of one number may be stored without a list.
+        shapes: shape of a row of each column, by name; a shape of a single number may be stored without a list.
         whole: names of columns of whole numbers (int64).
 
     Returns:
         Numbers by name, ``(row, *shape)``, or ``(row,)`` if whole; missing numbers are NaN.
 
     Raises:
-        UserError: naming the file, if it is missing, damaged, much larger than its bytes, or has other columns.
+        UserError: naming the file, if it is missing, damaged, unpacks to far more than its size, or has other columns.
     """
     paths = visible(root, pattern)
     require(1 <= len(paths) <= MOST_TENSORS, str(root), f"Parquet files {pattern}, at most {MOST_TENSORS}", str(len(paths)))
@@ -66,8 +66,8 @@ def read_texts(path: Path, number: str, name: str) -> dict[int, str]:
         require(max(size, file.metadata.num_rows) <= MOST_TEXT, str(path), f"texts of at most {MOST_TEXT} bytes", str(size))
         schema = file.schema_arrow
         texts = [field.name for field in schema if pa.types.is_string(field.type) or pa.types.is_large_string(field.type)]
-        known = number in schema.names and texts and pa.types.is_integer(schema.field(number).type)
-        require(known, str(path), f"the columns {number!r} and {name!r}", short(", ".join(schema.names)))
+        has_texts = number in schema.names and texts and pa.types.is_integer(schema.field(number).type)
+        require(has_texts, str(path), f"the columns {number!r} and {name!r}", short(", ".join(schema.names)))
         table = file.read(columns=[number, name if name in texts else texts[0]])
         return {key: text for key, text in zip(*(column.to_pylist() for column in table.columns), strict=True) if text is not None}
 
@@ -148,7 +148,7 @@ def _numbers(place: str, column: pa.ChunkedArray, shape: tuple[int, ...], whole:
         if isinstance(values, pa.ExtensionArray):
             values = values.storage
         if not _is_list(values.type):
-            break  # a vector of one number is the number itself
+            break  # a vector of a single number is the number itself
         even = not len(values) or pc.unique(pc.list_value_length(values)).to_pylist() == [size]
         require(even, place, f"{size} numbers in each list", "other lists")
         values = values.flatten()

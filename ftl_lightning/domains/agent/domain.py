@@ -47,8 +47,8 @@ def progressed(goal: str, states: Tensor, starts: InitialStates | None) -> Tenso
 def reached(goal: str, rollout: Rollout) -> dict[str, Tensor]:
     """Outcomes of episodes ``(episode,)`` of bool (paper, closed loop).
 
-    ``success``: the agent ends within :data:`~ftl_lightning.domains.agent.scenes.REACH` of the target and never was as near to the
-    distractor; ``distractor``: it was; ``progress``: it ends nearer to the target.
+    ``distractor``: the agent comes within :data:`~ftl_lightning.domains.agent.scenes.REACH` of the distractor. ``success``: it ends
+    within that distance of the target without ``distractor``. ``progress``: it ends nearer to the target than it starts.
     """
     world = rollout.observed[scenes.OBSERVED]
     to_target, to_distractor = _to_each(goal, world[..., :3], world[:, 0])
@@ -77,18 +77,18 @@ def act(plans: Tensor, step: int, observed: Observed) -> Tensor:
 def _straight(world: Tensor, chosen: Tensor) -> Tensor:
     """Plans ``(scene, horizon, 13)`` straight to the chosen object, at the expert's speed."""
     goal = scenes.object_positions(world)[torch.arange(len(world)), chosen]
-    way = (goal - world[:, :3])[:, None]
-    length = torch.linalg.vector_norm(way, dim=-1, keepdim=True)
+    direction = (goal - world[:, :3])[:, None]
+    length = torch.linalg.vector_norm(direction, dim=-1, keepdim=True)
     driven = torch.minimum(torch.arange(HORIZON)[None, :, None] * scenes.STEP * SPEED, length)
     plans = world[:, None, : scenes.STATE].repeat(1, HORIZON, 1)
-    plans[..., :3] = world[:, None, :3] + way * driven / length
+    plans[..., :3] = world[:, None, :3] + direction * driven / length
     return plans
 
 
 def _nearest(goal: str, count: int, starts: InitialStates | None, seed: int) -> Tensor:
     world = check_starts(starts).observed[scenes.OBSERVED]
-    away = torch.linalg.vector_norm(scenes.object_positions(world) - world[:, None, :3], dim=-1)
-    return _straight(world, away.argmin(dim=1))
+    distances = torch.linalg.vector_norm(scenes.object_positions(world) - world[:, None, :3], dim=-1)
+    return _straight(world, distances.argmin(dim=1))
 
 
 def _random(goal: str, count: int, starts: InitialStates | None, seed: int) -> Tensor:

@@ -85,17 +85,17 @@ class AgentEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         self._steps = 0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Seen, dict[str, Any]]:
-        """Build a scene: ``options['scene']``, 52 numbers, or one drawn for ``options['task']`` (default 'go to red object').
+        """Build a scene: ``options['scene']``, 52 numbers, else a scene drawn for ``options['task']`` (default 'go to red object').
 
         Raises:
             UserError: for a scene of the wrong size, with overlapping bodies, or with numbers that are not finite.
         """
         super().reset(seed=seed)
         options = options or {}
-        if (given := options.get("scene")) is None:
+        if (scene := options.get("scene")) is None:
             draw = int(self.np_random.integers(2**31))
-            given = scenes.scenes(options.get("task", "go to red object"), 1, draw)[0]
-        self._initial = scenes.check(np.asarray(given)).copy()
+            scene = scenes.scenes(options.get("task", "go to red object"), 1, draw)[0]
+        self._initial = scenes.check(np.asarray(scene)).copy()
         self._steps = 0
         self._build()
         return self._observation(), {}

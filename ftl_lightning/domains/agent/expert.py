@@ -1,4 +1,4 @@
-"""Expert that drives to the target in the same physics and avoids the distractor, and the source of its demonstrations."""
+"""Expert that drives to the target in simulation and avoids the distractor, and the source of its demonstrations."""
 
 import itertools
 from collections.abc import Callable, Mapping
@@ -46,8 +46,8 @@ Plane = NDArray[np.float64]
 
 def route(start: Plane, goal: Plane, distractor: Plane) -> Plane:
     """Corners ``(2 or 3, 2)`` of the route from the start to just before the target, in x and z."""
-    way = goal - start
-    end = goal - STOP * way / np.linalg.norm(way)
+    direction = goal - start
+    end = goal - STOP * direction / np.linalg.norm(direction)
     share = np.clip((distractor - start) @ (end - start) / ((end - start) @ (end - start)), 0, 1)
     nearest = start + share * (end - start)
     gap = nearest - distractor
@@ -84,15 +84,15 @@ def follow(env: "AgentEnvironment", initial: NDArray[np.float32], corners: Plane
     The environment is reset; the drive is cut at :data:`LENGTH` states.
     """
     observation = env.reset(options={"scene": initial})[0][scenes.OBSERVED]
-    seen = [observation]
+    observations = [observation]
     for step in range(LENGTH - 1):
         ahead = along(corners, (step + scenes.LOOKAHEAD) * scenes.STEP * SPEED)
         observation = env.step((ahead - observation[list(scenes.PLANE)]).astype(np.float32))[0][scenes.OBSERVED]
-        seen.append(observation)
+        observations.append(observation)
         near = np.linalg.norm(corners[-1] - observation[list(scenes.PLANE)]) < 0.02
         if near and np.linalg.norm(observation[7:10]) < AT_REST:
             break
-    return np.stack(seen)
+    return np.stack(observations)
 
 
 def environment() -> "AgentEnvironment":

@@ -82,7 +82,7 @@ Look = tuple[str, str]  # colour and shape
 
 @dataclass(frozen=True)
 class Goal:
-    """Look of the target: a key of :data:`COLOURS` and one of :data:`SHAPES`; ``None`` for any."""
+    """Target attributes: a key of :data:`COLOURS` and a key of :data:`SHAPES`; ``None`` for any."""
 
     colour: str | None
     shape: str | None
@@ -110,8 +110,8 @@ def parse(task: str) -> Goal:
 def pairs(goal: Goal) -> list[tuple[Look, Look]]:
     """Looks of target and distractor for a goal (paper, appendix on data).
 
-    For goals of one attribute, both are from the same group of pretraining; for goals of two, distractors are from pretraining and
-    share an attribute of the target.
+    For goals of a single attribute, both are from the same group of pretraining; for goals of two, distractors are from pretraining
+    and share an attribute of the target.
     """
     if goal.colour and goal.shape:
         target = (goal.colour, goal.shape)
@@ -210,9 +210,9 @@ def check(initial: Sequence[float] | NDArray[np.float32]) -> NDArray[np.float32]
     require(np.isfinite(state).all(), "initial state", "finite numbers", "others")
     centres = {"the agent": state[:3]} | {f"object {1 + i}": state[columns][:3] for i, columns in enumerate(OBJECT_COLUMNS)}
     for (a, first), (b, second) in itertools.combinations(centres.items(), 2):
-        apart = float(np.linalg.norm(first - second))
+        distance = float(np.linalg.norm(first - second))
         expected = f"centres {LEAST_DISTANCE} m apart"
-        require(apart >= LEAST_DISTANCE, f"initial state: {a} and {b} overlap", expected, f"{apart:.3f}")
+        require(distance >= LEAST_DISTANCE, f"initial state: {a} and {b} overlap", expected, f"{distance:.3f}")
     return state
 
 

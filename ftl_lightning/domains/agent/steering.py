@@ -1,4 +1,4 @@
-"""Drives led by hand: the agent follows the drawn route in the same physics as the expert."""
+"""Demonstrations from routes drawn by hand, which the agent follows in the expert's simulator."""
 
 import numpy as np
 import torch
@@ -39,7 +39,7 @@ def scene(task: str, seed: int) -> Scene:
 def record(scene_before: Scene, path: Numbers, seconds: Numbers) -> Demonstrations:
     """Drive at the expert's speed along the drawn route ``(step, 1, 2)`` in metres, to just before the first object on it.
 
-    The route is clipped to the picture; the speed of the hand is ignored, as it is not a property of the drive.
+    The route is clipped to the picture; the speed of drawing is ignored.
 
     Raises:
         UserError: for a route shorter than :data:`SHORTEST`, or without the simulator.
@@ -50,11 +50,11 @@ def record(scene_before: Scene, path: Numbers, seconds: Numbers) -> Demonstratio
     lower, upper = np.array(SEEN).T
     hand = np.concatenate((start, path[:, 0].clip(lower, upper)))
     length = reached(hand)[-1]
-    require(length >= SHORTEST, "way", f"one of at least {SHORTEST:g} m", f"{length:.2f} m; lead the agent further")
-    way = _before_objects(smoothed(hand, BLUR), object_positions(world)[0].double().numpy()[:, PLANE])
+    require(length >= SHORTEST, "way", f"at least {SHORTEST:g} m", f"{length:.2f} m; lead the agent further")
+    route = _before_objects(smoothed(hand, BLUR), object_positions(world)[0].double().numpy()[:, PLANE])
     env = environment()
     try:
-        drive = follow(env, world[0].numpy(), way)
+        drive = follow(env, world[0].numpy(), route)
     finally:
         env.close()
     return drives(torch.from_numpy(drive)[None], torch.tensor([len(drive)]), ("",), {"generator": "by hand", "domain": NAME})
@@ -64,5 +64,5 @@ def _before_objects(way: Plane, objects: Plane) -> Plane:
     """Corners ``(corner, 2)`` of a route up to contact with an object, at most :data:`LONGEST` metres."""
     fine = at_even_steps(way, int(np.ceil(reached(way)[-1] / FINE)) + 1)
     near = (np.linalg.norm(fine[:, None] - objects, axis=-1) < STOP).any(axis=1) | (reached(fine) > LONGEST)
-    kept = fine[: int(near.argmax()) if near.any() else None]
-    return at_even_steps(kept, int(np.ceil(reached(kept)[-1] / CORNER)) + 1)
+    free = fine[: int(near.argmax()) if near.any() else None]
+    return at_even_steps(free, int(np.ceil(reached(free)[-1] / CORNER)) + 1)

@@ -24,8 +24,8 @@ PAPER = _suite(COMPOSITIONS)
 VALIDATION = _suite(
     ("go to green cone", "go to purple sphere", "go to green sphere", "go to red cone", "go to yellow sphere", "go to purple bowl")
 )
-"""Other targets with distractors by the paper's rule: three new combinations of colour and shape, three from pretraining, each
-with a known and two new distractors."""
+"""Targets for tuning: three new combinations of colour and shape and three from pretraining, each with a known and two new
+distractors, by the paper's rule."""
 
 
 def _parts(task: str) -> tuple[str, str]:
@@ -55,7 +55,7 @@ COMPOSED = Suite(
         EvaluationTask("new + training", "go to purple bowl", learned=("go to purple object",), texts=("go to bowl",)),
     )
 )
-"""Targets of the validation suite as compositions of colour and shape, one or both learned; for tuning."""
+"""Targets of the validation suite as compositions of colour and shape, either or both learned; for tuning."""
 
 SUITES = {"training": TRAINING, "paper": PAPER, "components": COMPONENTS, "validation": VALIDATION, "compositions": COMPOSED}
 

@@ -58,10 +58,10 @@ def _random(goal: str, starts: InitialStates, demonstrations: Demonstrations | N
 
 def _transitions(goal: str, demonstrations: Demonstrations | None) -> tuple[Observed, Tensor]:
     """Observations ``(n, *shape)`` by name and next states ``(n, 7)`` of all steps of the demonstrations."""
-    known = traffic.training_set("train", SHOWN).select(goal) if demonstrations is None else demonstrations
-    pairs = [(row, time) for row, length in enumerate(known.lengths.tolist()) for time in range(length - 1)]
+    examples = traffic.training_set("train", SHOWN).select(goal) if demonstrations is None else demonstrations
+    pairs = [(row, time) for row, length in enumerate(examples.lengths.tolist()) for time in range(length - 1)]
     rows, times = torch.tensor(pairs).T
-    return {name: values[rows, times] for name, values in known.observed.items()}, known.states[rows, times + 1]
+    return {name: values[rows, times] for name, values in examples.observed.items()}, examples.states[rows, times + 1]
 
 
 def _nearest(goal: str, starts: InitialStates, demonstrations: Demonstrations | None, seed: int) -> Policy:

@@ -66,8 +66,8 @@ class DrivingEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         self.simulation.reset(seed=start)
         self._seed, self._return, self._length = start, 0.0, 0
         self._beliefs = Beliefs(self.simulation, name)
-        seen = observe(self.simulation)
-        same = given is None or np.allclose(traffic.scene(seen, name, start), given, atol=1e-3)
+        observed = observe(self.simulation)
+        same = given is None or np.allclose(traffic.scene(observed, name, start), given, atol=1e-3)
         expected = f"the initial state of {name!r} for seed {start}"
         require(same, "driving scene", expected, "another; an episode cannot start in the middle of a drive")
         return self.observation(), {}
@@ -99,22 +99,22 @@ class DrivingEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
             return int(wish[0])
         states = {decision: worlds.state(decision) for decision in range(self.simulation.action_space.n)}
         there = {decision: state for decision, state in states.items() if state is not None}
-        far = self._far(now, np.stack(list(there.values())), wish) if there and len(wish) > 1 else np.zeros(len(there))
+        distances = self._far(now, np.stack(list(there.values())), wish) if there and len(wish) > 1 else np.zeros(len(there))
         risks: dict[int, float] = {}
         nearest = math.inf
-        for decision, distance in sorted(zip(there, far.tolist(), strict=True), key=lambda pair: pair[1]):
+        for decision, distance in sorted(zip(there, distances.tolist(), strict=True), key=lambda pair: pair[1]):
             if distance > nearest + 1e-6:  # a nearer decision has no risk
                 break
             risks[decision] = worlds.risk(decision)
             nearest = distance if risks[decision] == 0 else nearest
-        least = min(risks.values(), default=1)
-        if least == 1:
+        lowest = min(risks.values(), default=1)
+        if lowest == 1:
             return int(self.simulation.action_type.actions_indexes["SLOWER"])
-        kept = [(decision, distance) for decision, distance in zip(there, far, strict=True) if risks.get(decision) == least]
-        closest = min(distance for _, distance in kept)
-        if len(wish) == 1 and int(wish[0]) in dict(kept):
+        candidates = [pair for pair in zip(there, distances, strict=True) if risks.get(pair[0]) == lowest]
+        closest = min(distance for _, distance in candidates)
+        if len(wish) == 1 and int(wish[0]) in dict(candidates):
             return int(wish[0])
-        return int(self.np_random.choice([decision for decision, distance in kept if distance <= closest + 1e-6]))
+        return int(self.np_random.choice([decision for decision, distance in candidates if distance <= closest + 1e-6]))
 
     @staticmethod
     def _far(now: NDArray[np.float64], states: NDArray[np.float64], wish: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -240,21 +240,21 @@ def demonstrations(
     kept: list[tuple[int, np.ndarray]] = []
     driven = 0
     seeds = [traffic.episode_seed(seed, number) for number in range(MOST * count)]
-    for driven, (seen, succeeded) in enumerate(_episodes(name, seeds, workers, blind), start=1):
+    for driven, (states, succeeded) in enumerate(_episodes(name, seeds, workers, blind), start=1):
         if succeeded:
-            kept.append((seeds[driven - 1], seen))
+            kept.append((seeds[driven - 1], states))
             progress()
         if len(kept) == count:
             break
     require(len(kept) == count, f"driving {name!r}", f"{count} successful episodes of {driven}", len(kept))
-    longest = max(len(seen) for _, seen in kept) + traffic.HORIZON
-    seen = np.stack([driven_on(seen, name, longest) for _, seen in kept])
-    vehicles = torch.from_numpy(seen).float().flatten(2)
-    scenes = torch.from_numpy(np.stack([traffic.scene(seen[0], name, start) for start, seen in kept]))
+    longest = max(len(states) for _, states in kept) + traffic.HORIZON
+    states = np.stack([driven_on(states, name, longest) for _, states in kept])
+    vehicles = torch.from_numpy(states).float().flatten(2)
+    scenes = torch.from_numpy(np.stack([traffic.scene(states[0], name, start) for start, states in kept]))
     provenance = {"generator": traffic.NAME, "seed": seed, "count": count, "driven": driven, "rejected": driven - count}
     return Demonstrations(
         states=vehicles[..., : traffic.STATE].contiguous(),
-        lengths=torch.tensor([len(seen) for _, seen in kept]),
+        lengths=torch.tensor([len(states) for _, states in kept]),
         domain=traffic.NAME,
         state_names=traffic.STATE_NAMES,
         state_units=traffic.STATE_UNITS,

@@ -241,7 +241,7 @@ class FastRoad(Road):
 
 
 class FastRegulatedRoad(FastRoad, RegulatedRoad):
-    """Predicts each trajectory once and checks only pairs that come near each other."""
+    """Regulated road that predicts each trajectory once and checks only pairs of vehicles that come near each other."""
 
     def step(self, dt: float) -> None:
         self.steps += 1

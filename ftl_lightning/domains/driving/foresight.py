@@ -1,8 +1,9 @@
-"""The planner's veto: risk of crashes within its look-ahead and knowledge.
+"""The planner's veto of decisions, by the risk of a crash within a look-ahead.
 
 Vetoes, shared by all methods and baselines: ``step``, one-step look-ahead in the true simulation (the paper's); ``simulation``,
-several decisions of look-ahead in it; ``belief``, the same in worlds sampled from observations, see :class:`Beliefs`. The risk of a
-decision is the share of worlds in which it, or everything that may follow it, crashes (compare PDM-Closed; Dauner et al., 2023).
+look-ahead of several decisions in the true simulation; ``belief``, the same in worlds sampled from observations, see
+:class:`Beliefs`. The risk of a decision is the share of worlds in which the decision or all its continuations crash (compare
+PDM-Closed; Dauner et al., 2023).
 """
 
 import itertools
@@ -22,7 +23,7 @@ from ftl_lightning.domains.driving.traffic import BELIEF, SIMULATION, STEP
 
 @dataclass(frozen=True)
 class Foresight:
-    """Decisions of look-ahead, including the first, and number of sampled worlds; 0 for the true simulation."""
+    """Depth of look-ahead in decisions, and number of sampled worlds (0 for the true simulation)."""
 
     depth: int
     beliefs: int = 0
@@ -30,7 +31,7 @@ class Foresight:
 
 VETOES = {BELIEF: Foresight(3, 8), SIMULATION: Foresight(3), STEP: Foresight(1)}
 FRAMES, SIGHT = 5, 100.0
-"""Simulation frames per decision, and distance in metres within which other vehicles are part, of sampled worlds."""
+"""Sampled worlds: simulation frames per decision, and maximum distance in metres of the simulated vehicles."""
 AFTERWARDS = ("IDLE", "SLOWER", "FASTER", "LANE_LEFT", "LANE_RIGHT")
 """Follow-up decisions, in the order in which they are tried."""
 Meaning = tuple[float, tuple[str, str, int]]  # target speed and lane
@@ -88,7 +89,7 @@ class Beliefs:
 
 
 def meaning(env: AbstractEnv, decision: int) -> Meaning:
-    """Effect of a decision; decisions of equal effect are equivalent, such as speeding up at the highest speed."""
+    """Effect of a decision, equal for equivalent decisions, such as idling and speeding up at the highest speed."""
     now = save(env)
     env.action_type.act(decision)
     effect = env.vehicle.target_speed, env.vehicle.target_lane_index
@@ -138,7 +139,7 @@ class Worlds:
         return None
 
     def risk(self, decision: int) -> float:
-        """Share of worlds in which a decision, or everything that may follow it, crashes."""
+        """Share of worlds in which a decision or all its continuations crash."""
         with self._imagining():
             key = self._key(decision)
             if key not in self._risks:

@@ -29,7 +29,7 @@ MARGIN, MAX_ASPECT = 20.0, 1.8
 AREA, PAGE = 9.0, 13.0
 """Area of a panel in square inches and width of a figure in inches."""
 PLAN_REACH = 25.0
-"""Distance from the driven path, in metres, within which plans extend the window of a film."""
+"""Maximum distance in metres from the driven path at which plans extend the window of a film."""
 LEGEND = (
     Patch(color=EGO, label="controlled vehicle, its way"),
     Patch(color=OTHER, label="other vehicles"),
@@ -97,9 +97,9 @@ def render(states: Tensor, right: Sequence[bool] | None, title: str, starts: Ini
         if number >= len(shown):
             axes.set_axis_off()
             continue
-        seen = take(starts.observed, number)
-        vehicles = seen[TRAFFIC].unflatten(0, (VEHICLES, -1)).numpy()
-        _draw(axes, NAMES[int(seen[SCENARIO].item())], vehicles, shown[number], windows[number])
+        observed = take(starts.observed, number)
+        vehicles = observed[TRAFFIC].unflatten(0, (VEHICLES, -1)).numpy()
+        _draw(axes, NAMES[int(observed[SCENARIO].item())], vehicles, shown[number], windows[number])
         for spine in axes.spines.values():
             spine.set(color=PLAIN if right is None else RIGHT if right[number] else WRONG, linewidth=1.5)
     figure.legend(handles=LEGEND, loc="outside lower center", ncols=len(LEGEND), frameon=False)
@@ -136,9 +136,9 @@ def film(rollout: Rollout, plans: Tensor) -> list[NDArray[np.uint8]]:
         figure = Figure(figsize=(max(width, 4.0), height + 0.4), dpi=90, layout="constrained")
         canvas = FigureCanvasAgg(figure)
         axes = figure.subplots()
-        seen = _between(vehicles[time], vehicles[min(time + 1, end - 1)], moment - time)
-        _draw(axes, name, seen, plans[time].numpy() if time < len(plans) else None, window)
-        axes.plot(*np.concatenate((ways[: time + 1], seen[:1, 1:3])).T, color=EGO, linewidth=1.5, zorder=1)
+        current = _between(vehicles[time], vehicles[min(time + 1, end - 1)], moment - time)
+        _draw(axes, name, current, plans[time].numpy() if time < len(plans) else None, window)
+        axes.plot(*np.concatenate((ways[: time + 1], current[:1, 1:3])).T, color=EGO, linewidth=1.5, zorder=1)
         now = f"{name}, {time * decision_seconds(name):g} s, {np.linalg.norm(traffic[time, 0, 3:5]):.0f} m/s"
         axes.set_title(f"{now}: {ended}" if moment == end - 1 else now, fontsize=9)
         figure.legend(handles=LEGEND, loc="outside lower center", ncols=len(LEGEND), frameon=False, fontsize=7, columnspacing=1)
@@ -169,14 +169,14 @@ def plan_film(states: Tensor, starts: InitialStates | None) -> VectorFilm:
     """Top-view film of a plan or demonstration ``(time, 7)`` among resting vehicles; raises a ``UserError`` without the
     simulator.
     """
-    seen = take(check_starts(starts).observed, 0)
-    vehicles = seen[TRAFFIC].unflatten(0, (VEHICLES, -1)).numpy()
+    observed = take(check_starts(starts).observed, 0)
+    vehicles = observed[TRAFFIC].unflatten(0, (VEHICLES, -1)).numpy()
     ego = states.numpy().copy()
     ego[:, 0] = 1
     ego[:, 5:] /= np.maximum(np.linalg.norm(ego[:, 5:], axis=1, keepdims=True), 1e-6)  # generated headings are not normalised
     others = [Shape("area", _corners(vehicle[None]), OTHER) for vehicle in vehicles[1:] if vehicle[0] > 0]
     planned = Shape("dots", (ego[None, :, 1:3] * (1, -1)).astype(np.float32), PLAN, 0.9)
-    return _from_above(NAMES[int(seen[SCENARIO].item())], [planned, *others], ego)
+    return _from_above(NAMES[int(observed[SCENARIO].item())], [planned, *others], ego)
 
 
 def _from_above(name: str, others: Sequence[Shape], ego: NDArray[np.float32]) -> VectorFilm:
@@ -202,14 +202,14 @@ def _followed(traffic: NDArray[np.float32], seconds: float) -> list[NDArray[np.f
     """Track vehicles ``(decision, 7)`` in the nearest vehicles ``(decision, vehicle, 7)``, whose order changes."""
     known: list[NDArray[np.float32]] = []
     for time, seen in enumerate(traffic):
-        left = [vehicle for vehicle in seen if vehicle[0] > 0]
+        unmatched = [vehicle for vehicle in seen if vehicle[0] > 0]
         for track in known:
             before = track[time - 1]
             expected = before[1:3] + seconds * before[3:5]
-            away = [float(np.linalg.norm(vehicle[1:3] - expected)) for vehicle in left] if before[0] > 0 else []
-            if away and min(away) < SAME:
-                track[time] = left.pop(int(np.argmin(away)))
-        for vehicle in left:
+            distances = [float(np.linalg.norm(vehicle[1:3] - expected)) for vehicle in unmatched] if before[0] > 0 else []
+            if distances and min(distances) < SAME:
+                track[time] = unmatched.pop(int(np.argmin(distances)))
+        for vehicle in unmatched:
             known.append(np.zeros((len(traffic), seen.shape[1]), dtype=np.float32))
             known[-1][time] = vehicle
     return known

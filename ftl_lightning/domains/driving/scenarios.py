@@ -111,14 +111,14 @@ class ThirdExit(Roundabout):
 
 @dataclass(frozen=True)
 class Scenario:
-    """Scenario.
+    """Driving scenario.
 
     Attributes:
         environment: class of the environment.
         config: settings that differ from highway-env's.
         arrived: whether the vehicle is at its destination, crashed or not; on the highway, whether time is up.
         passed: weaker criterion of the paper's code, crashed or not; ``None`` for ``arrived`` without a crash.
-        drivers: classes of the other vehicles, original and fast.
+        drivers: classes of the other vehicles, of highway-env and fast.
         destinations: possible destinations of the other vehicles.
         cruise: minimum desired speed of the other vehicles, in m/s.
     """

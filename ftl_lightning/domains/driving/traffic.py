@@ -80,8 +80,8 @@ def origin(given: NDArray[np.float32]) -> tuple[str, int]:
     numbers = given.shape == (SCENE,) and np.isfinite(given).all()
     require(numbers, "driving scene", f"{SCENE} finite numbers", f"shape {given.shape}")
     number, seed = given[OBSERVED:].tolist()
-    known = number in range(len(NAMES)) and 0 <= seed < SEEDS and seed == int(seed)
-    require(known, "driving scene", f"a scenario from 0 to {len(NAMES) - 1} and a seed", f"{number:g} and {seed:g}")
+    valid = number in range(len(NAMES)) and 0 <= seed < SEEDS and seed == int(seed)
+    require(valid, "driving scene", f"a scenario from 0 to {len(NAMES) - 1} and a seed", f"{number:g} and {seed:g}")
     return NAMES[int(number)], int(seed)
 
 

@@ -35,15 +35,15 @@ def turn(before: Tensor, after: Tensor) -> Tensor:
 
 
 def way(before: Tensor, after: Tensor) -> Tensor:
-    """Metres ``(..., 2)`` along and across the mean heading; on a curve: nearly its length, and 0."""
-    seen = turned(after[..., 1:3] - before[..., 1:3], before[..., 5], -before[..., 6])
+    """Displacement ``(..., 2)`` in metres along and across the mean heading; on a curve nearly its length, and 0."""
+    displacement = turned(after[..., 1:3] - before[..., 1:3], before[..., 5], -before[..., 6])
     cos, sin = turn(before, after).unbind(-1)
     half = torch.atan2(sin, cos) / 2
-    return turned(seen, half.cos(), -half.sin())
+    return turned(displacement, half.cos(), -half.sin())
 
 
 def drive(before: Tensor, after: Tensor) -> Tensor:
-    """Displacement and final velocity ``(..., 4)``: the driver's decision, independent of the road's direction."""
+    """Displacement and final velocity ``(..., 4)``, independent of the road's direction, as of a driver's decision."""
     return torch.cat((way(before, after), speed(after)), dim=-1)
 
 
@@ -74,9 +74,9 @@ def _observe_from_ego(observed: Observed) -> Observed:
     presence, *parts = others.split((1, 2, 2, 2), dim=-1)
     parts[0] = parts[0] - ego[:, None, 1:3]
     place, velocity, heading = (turned(part, ego[:, None, 5], -ego[:, None, 6]) for part in parts)
-    seen = torch.cat((presence, _near(place), velocity - speed(ego)[:, None], heading), dim=-1) * presence
+    relative = torch.cat((presence, _near(place), velocity - speed(ego)[:, None], heading), dim=-1) * presence
     pose = torch.cat((ego[:, 1:3], _near(ego[:, 1:2]), _near(ego[:, 2:3]), ego[:, 5:]), dim=-1) * _known(observed)
-    return {TRAFFIC: torch.cat((pose[:, :4], ego[:, 3:5].norm(dim=-1, keepdim=True), pose[:, 4:], seen.flatten(1)), dim=-1)}
+    return {TRAFFIC: torch.cat((pose[:, :4], ego[:, 3:5].norm(dim=-1, keepdim=True), pose[:, 4:], relative.flatten(1)), dim=-1)}
 
 
 def _known(observed: Observed) -> Tensor:
@@ -138,10 +138,10 @@ def _perturb(states: Tensor, observed: Observed, draw: torch.Generator | None) -
     else:
         noise = drawn(len(states), lambda n: torch.randn((n, 2), generator=draw, device=draw.device))
     ego = _vehicles(observed)[:, 0]
-    known = _known(observed) & (noise[:, 1:] > 0)
-    pace = (speed(ego)[:, :1] + torch.where(known, 0, PERTURBATION * noise[:, :1])).clamp(min=0)
+    is_known = _known(observed) & (noise[:, 1:] > 0)
+    pace = (speed(ego)[:, :1] + torch.where(is_known, 0, PERTURBATION * noise[:, :1])).clamp(min=0)
     now = torch.cat((ego[:, :3], pace * ego[:, 5:], ego[:, 5:]), dim=-1)
-    traffic = torch.cat((ego[:, :1] * known, now[:, 1:], observed[TRAFFIC][:, STATE:]), dim=-1)
+    traffic = torch.cat((ego[:, :1] * is_known, now[:, 1:], observed[TRAFFIC][:, STATE:]), dim=-1)
     return torch.cat((now[:, None], states[:, 1:]), dim=1), {**observed, TRAFFIC: traffic}
 
 

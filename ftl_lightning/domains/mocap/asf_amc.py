@@ -48,7 +48,7 @@ class Skeleton:
     bones: dict[str, Bone]  # by name, parents first
 
     def joints(self, motion: dict[str, NDArray[np.float64]]) -> NDArray[np.float64]:
-        """Joint positions ``(frame, 14, 3)`` in metres, y up, of a motion of :func:`read_amc`; bones without motion rest."""
+        """Joint positions ``(frame, 14, 3)`` in metres, y up, of a motion of :func:`read_amc`; other bones are at rest."""
         channels = [name.lower() for name in self.order]
         moved = np.stack([motion[ROOT][:, channels.index(name)] for name in ("tx", "ty", "tz")], axis=1)
         turned = _turns(motion[ROOT], channels, "".join(name[1] for name in channels if name[0] == "r"))

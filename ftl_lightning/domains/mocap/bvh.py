@@ -34,7 +34,7 @@ class Node:
 
 @dataclass(frozen=True)
 class Motion:
-    """Content of a file."""
+    """Skeleton and motion of a BVH file."""
 
     nodes: tuple[Node, ...]  # parents first; the root is the first
     frames: Numbers  # (frame, channel), the nodes' numbers in sequence, angles in degrees
@@ -174,7 +174,7 @@ SHORTEST = 1e-6  # Minimum length in metres of a bone with a direction; shorter 
 
 
 class Joint(NamedTuple):
-    """Joint of an exported file."""
+    """Joint of a BVH file written here."""
 
     name: str  # in the MotionBuilder-friendly conversion
     parent: int  # index in TREE; -1 for the root

@@ -37,7 +37,7 @@ def places(relative: Tensor) -> Tensor:
 
 
 def sizes(relative: Tensor) -> Tensor:
-    """Total bone length of the body half of each bone ``(sample, frame, 14, 3)``: ``(sample, 1, 14, 1)``."""
+    """Size of each bone's body half ``(sample, 1, 14, 1)``: the sum of its bone lengths, from bones ``(sample, frame, 14, 3)``."""
     length = torch.linalg.vector_norm(relative, dim=-1).mean(dim=1, keepdim=True)
     half = [length[..., list(part)].sum(dim=-1) for part in (LOWER, UPPER)]
     return torch.stack([half[joint in UPPER] for joint in range(JOINTS)], dim=-1)[..., None].clamp_min(1e-3)
@@ -203,10 +203,10 @@ def turns(states: Tensor, joints: Sequence[int]) -> Tensor:
     right = [joint for joint in (RK, RA, RE, RW) if joint in joints]
     features: list[Tensor] = []
     for side in (right, [skeleton.MIRROR[joint] for joint in right]):
-        way = (where[:, :, side] - where[:, :, side].mean(dim=1, keepdim=True)).transpose(1, 2)
-        extents = torch.linalg.eigvalsh(way.transpose(2, 3) @ way / way.shape[2]).flip(-1).clamp_min(0).sqrt()
-        steps = torch.diff(way, dim=2)
-        area = torch.linalg.vector_norm(torch.linalg.cross(way[:, :, :-1], steps).sum(dim=2), dim=-1, keepdim=True) / 2
+        path = (where[:, :, side] - where[:, :, side].mean(dim=1, keepdim=True)).transpose(1, 2)
+        extents = torch.linalg.eigvalsh(path.transpose(2, 3) @ path / path.shape[2]).flip(-1).clamp_min(0).sqrt()
+        steps = torch.diff(path, dim=2)
+        area = torch.linalg.vector_norm(torch.linalg.cross(path[:, :, :-1], steps).sum(dim=2), dim=-1, keepdim=True) / 2
         length = torch.linalg.vector_norm(steps, dim=-1).sum(dim=2)[..., None]
         first = extents[..., :1] + 0.02
         features.append(torch.cat([_log(extents, 0.01), extents[..., 1:] / first, area / first**2, length / first], dim=-1))
@@ -251,12 +251,12 @@ def extremes(states: Tensor, joints: Sequence[int]) -> Tensor:
     down = where.new_tensor((0.0, 0.0, -1.0))
     features: list[Tensor] = []
     if RK in joints:
-        apart = where[:, :, RA, 0] - where[:, :, LA, 0]
+        width = where[:, :, RA, 0] - where[:, :, LA, 0]
         features += [_extremes(_both(where, joint, axis)) for joint, axis in ((RA, 2), (RA, 1), (RA, 0), (RK, 2), (RK, 1))]
         features += [_paces(speed[:, :, [RA, LA]]), _paces(speed[:, :, [RK, LK]])]
         features += [_extremes(_bent(limbs, RK, RA)), _extremes(_angle(limbs[:, :, [RK, LK]], down))]
         features += [_pair_together(_both(where, joint, axis)) for joint, axis in ((RA, 1), (RA, 2), (RK, 2))]
-        features += [_pair_together(speed[:, :, [RA, LA]]), torch.stack([apart.amax(1), apart.amin(1), apart.mean(1)], dim=1)]
+        features += [_pair_together(speed[:, :, [RA, LA]]), torch.stack([width.amax(1), width.amin(1), width.mean(1)], dim=1)]
     if NECK in joints:
         neck, shoulders = where[:, :, NECK], where[:, :, RS] - where[:, :, LS]
         turn = torch.atan2(shoulders[..., 1], shoulders[..., 0])
@@ -278,6 +278,6 @@ def extremes(states: Tensor, joints: Sequence[int]) -> Tensor:
         ]
     if NECK in joints and RK in joints:
         legs, arms = (_log(speed[:, :, pair].mean(dim=1), 0.05).mean(dim=1, keepdim=True) for pair in ([RA, LA], [RW, LW]))
-        features += [legs - arms, _together(where[:, :, [RW, LW], 2].mean(dim=-1), apart.abs())]
+        features += [legs - arms, _together(where[:, :, [RW, LW], 2].mean(dim=-1), width.abs())]
         features += [_ways_together(where, right, left, 1) for right, left in (((RW, RA), (LW, LA)), ((RW, LA), (LW, RA)))]
     return torch.cat(features, dim=1)

@@ -130,8 +130,8 @@ class Recogniser(nn.Module):
         actions_only = torch.tensor([name not in RESTING for name in self.classes])
         excluded = self._still(states)[:, None]
         if len(self.verifiers):
-            least = torch.tensor([VERIFIED.get(name, -torch.inf) for name in self.classes])
-            excluded = excluded | (self.verified(states) < least)
+            thresholds = torch.tensor([VERIFIED.get(name, -torch.inf) for name in self.classes])
+            excluded = excluded | (self.verified(states) < thresholds)
         return scores.masked_fill(excluded & actions_only, -torch.inf)
 
     def verified(self, states: Tensor) -> Tensor:
@@ -146,8 +146,8 @@ class Recogniser(nn.Module):
     def _still(self, states: Tensor) -> Tensor:
         """Whether no joint moves far within a sixth of a second: ``(sample,)``. Trembling joints are still."""
         positions = as_joints(states)[:, :, list(self.joints)]
-        way = torch.linalg.vector_norm(positions[:, _SIXTH:] - positions[:, :-_SIXTH], dim=-1)
-        return way.amax(dim=(1, 2)) * (FPS / _SIXTH) < STILL
+        displacement = torch.linalg.vector_norm(positions[:, _SIXTH:] - positions[:, :-_SIXTH], dim=-1)
+        return displacement.amax(dim=(1, 2)) * (FPS / _SIXTH) < STILL
 
     def says(self, states: Tensor, name: str) -> Tensor:
         """Whether windows ``(sample, 32, 42)`` show a class: ``(sample,)`` of bool; ``False`` for nonfinite windows."""
@@ -196,7 +196,7 @@ class Judge(nn.Module):
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read a judge; raise a ``UserError`` for a file that is missing, damaged or of another form."""
+        """Read a judge; raise a ``UserError`` for a file that is missing, damaged or of another kind."""
         remedy = "take it from the project's repository, or make it with benchmarks/experiments/mocap_judge.py"
         require(Path(path).is_file(), str(path), "the judge of motion", f"nothing; {remedy}")
         tensors, header = load_tensors(path, KIND)

@@ -122,10 +122,10 @@ def read_folder(root: Path | None) -> tuple[Recordings, tuple[Segment, ...]]:
 
 
 MAX_SPEED = 12.0
-"""Maximum joint speed in metres per second. Faster frames are glitches, or hips without defined yaw; trials are cut there."""
+"""Maximum joint speed in metres per second. Trials are cut at faster frames: glitches, or hips without defined yaw."""
 LONGEST = 128  # Maximum frames of a piece; parts of longer pieces overlap by a window less a frame, so that no window is lost
 OTHER_FIGURES = ("bvh_daz",)  # Excluded kinds of recordings: all subjects retargeted to the same figure
-CYCLE = 8  # Frames; periodic motion has at least twice as many per period
+CYCLE = 8  # Frames, at most half a period of periodic motion
 ARMS_DOWN = 0.4  # Maximum distance in metres from wrist to hip, sideways and vertical, of hanging arms
 UPRIGHT = 0.35  # Minimum height in metres of shoulders above hips; half the minimum height of hips above ankles
 
@@ -147,7 +147,7 @@ def moving(motions: Sequence[Tensor], concepts: Sequence[str], provenance: Mappi
 
 
 class Piece(NamedTuple):
-    """Part of a trial, given by number, without glitches; its states ``(frame, 42)`` are at least as long as a window."""
+    """Part of a trial without glitches: number of the trial, concept, and states ``(frame, 42)``, at least as long as a plan."""
 
     trial: int
     concept: str
@@ -177,22 +177,21 @@ class Recorded:
     def split(self, name: Split, count: int, seed: int) -> Demonstrations:
         """All pieces of trials of the training concepts, and in ``train`` their mirror images; ``count`` and ``seed`` are unused.
 
-        See :func:`validation_trials`. A mirror image has the description with left and right exchanged, and is omitted if this is
-        no training concept. A ``UserError`` if the folder has no trial for the split.
+        See :func:`validation_trials`. Mirroring exchanges left and right in the description; mirror images of which it is no
+        training concept are omitted. A ``UserError`` if the folder has no trial for the split.
         """
-        wanted = [piece for piece in self._pieces if (piece.trial in self._validation) == (name == "validation")]
-        require(wanted, str(self.root), f"trials of the training concepts for {name}", "none; use more of the database")
+        chosen = [piece for piece in self._pieces if (piece.trial in self._validation) == (name == "validation")]
+        require(chosen, str(self.root), f"trials of the training concepts for {name}", "none; use more of the database")
         if name == "train":
-            reflected = [Piece(piece.trial, tasks.mirrored_text(piece.concept), mirrored(piece.states)) for piece in wanted]
-            wanted += [piece for piece in reflected if piece.concept in TRAINING_CONCEPTS]
-        return self._demonstrations(wanted, {"split": name})
+            reflected = [Piece(piece.trial, tasks.mirrored_text(piece.concept), mirrored(piece.states)) for piece in chosen]
+            chosen += [piece for piece in reflected if piece.concept in TRAINING_CONCEPTS]
+        return self._demonstrations(chosen, {"split": name})
 
     def draw(self, task: str, count: int, seed: int, workers: int = 1) -> Demonstrations:
         """Demonstrations of a concept, without replacement if there are enough.
 
-        For a new concept, windows as long as a plan, each from a pose nearest to standing at rest, which aligns them in time. If
-        there are too few, windows from random frames follow. For a training concept, pieces of its trials. A ``UserError`` if no
-        trial of the folder shows the concept.
+        For a training concept, pieces of its trials. For a new concept, windows as long as a plan, aligned in time by
+        :func:`at_rest` and, if there are too few, windows at random. A ``UserError`` if no trial of the folder shows the concept.
         """
         new = task in tasks.NEW_CONCEPTS
         shown = self._shown(task) if new else [piece for piece in self._pieces if piece.concept == task]
@@ -282,8 +281,8 @@ def unused_reason(recordings: Recordings, trial: int) -> str:
 
 def training_pieces(recordings: Recordings) -> list[Piece]:
     """Pieces of training and validation trials, in the order of the trials."""
-    wanted = [trial for trial in range(len(recordings)) if not unused_reason(recordings, trial)]
-    return [Piece(trial, recordings.label[trial], states) for trial in wanted for states in pieces(recordings.trial(trial))]
+    used = [trial for trial in range(len(recordings)) if not unused_reason(recordings, trial)]
+    return [Piece(trial, recordings.label[trial], states) for trial in used for states in pieces(recordings.trial(trial))]
 
 
 def validation_trials(training: Sequence[Piece]) -> frozenset[int]:
@@ -315,11 +314,11 @@ def glitches(states: NDArray[np.float32]) -> list[int]:
 
 
 def at_rest(states: Tensor) -> list[int]:
-    """Start frames of windows of ``(frame, 42)``: nearest to standing within :data:`CYCLE` frames on both sides."""
+    """Start frames of windows in ``(frame, 42)``: local minima of the distance to standing, within :data:`CYCLE` frames."""
     (standing,) = skeleton.standing_poses(1, generator("cpu", 0))
-    far = torch.linalg.vector_norm(states - standing, dim=1)
+    distance = torch.linalg.vector_norm(states - standing, dim=1)
     frames = range(len(states) - HORIZON + 1)
-    return [frame for frame in frames if far[frame] == far[max(frame - CYCLE, 0) : frame + CYCLE + 1].min()]
+    return [frame for frame in frames if distance[frame] == distance[max(frame - CYCLE, 0) : frame + CYCLE + 1].min()]
 
 
 def hang_down(poses: Tensor) -> Tensor:

@@ -44,7 +44,7 @@ class Relation:
     """Relation between shapes.
 
     Attributes:
-        kind: one of :data:`PAIRWISE`, or ``'ring'`` (all three shapes on a circle).
+        kind: from :data:`PAIRWISE`, or ``'ring'`` (all three shapes on a circle).
         shapes: ordered pair (A, B), or all three shapes for a ring.
         radius: circumradius of a ring, 0 otherwise.
         negated: whether the relation must not hold.

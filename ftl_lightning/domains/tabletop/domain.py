@@ -19,7 +19,7 @@ from ftl_lightning.domains.execution import ClosedLoop, Policy, Rollout
 from ftl_lightning.domains.pictures import Show
 from ftl_lightning.domains.tabletop import interface
 from ftl_lightning.domains.tabletop.experts import PUSH_HEIGHT
-from ftl_lightning.domains.tabletop.interface import PUSH, PUSH_ON_BOOK, WIDE_CONCEPTS, WIDE_NAME, check_simulator
+from ftl_lightning.domains.tabletop.interface import PLACES, PUSH, PUSH_ON_BOOK, WIDE_CONCEPTS, WIDE_NAME, check_simulator
 from ftl_lightning.domains.tabletop.scenes import OBJECTS, TRIANGLE
 from ftl_lightning.services.errors import UserError
 
@@ -130,7 +130,7 @@ DOMAIN = Domain(
     concepts=Concepts(interface.TRAINING_CONCEPTS, interface.SUITES, table=_FOLDER / "embeddings.safetensors"),
     source=source,
     observed=interface.FEATURES,
-    recordings=Recordings(privileged={interface.PLACES: Privileged(interface.SEEN, interface.misplaced, interface.told)}),
+    recordings=Recordings(privileged={PLACES: Privileged(interface.SEEN, interface.keypoint_loss, interface.noisy_keypoints)}),
     show=Show(deferred(f"{RENDERING}:render"), vector_film=deferred(f"{RENDERING}:plan_film")),
     closed_loop=_LOOP,
     comparison=Comparison(

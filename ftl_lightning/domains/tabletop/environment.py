@@ -109,9 +109,9 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
             options: ``scene``, 24 numbers; or ``task``, whose scene is drawn (default 'push green circle to orange triangle').
         """
         super().reset(seed=seed)
-        if (given := (options or {}).get("scene")) is None:
-            given = draw_scene(check_task((options or {}).get("task", PUSH)), self.np_random)
-        self.scene = check(given).copy()
+        if (scene := (options or {}).get("scene")) is None:
+            scene = draw_scene(check_task((options or {}).get("task", PUSH)), self.np_random)
+        self.scene = check(scene).copy()
         if self._built == RECYCLE:
             self.client.disconnect()
             self.client, self._built = self._connected(), 0
@@ -141,15 +141,15 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         valid = values.shape == (ACTION,) and np.isfinite(values).all()
         require(valid, "table-top action", f"{ACTION} finite numbers", values.tolist())
         before = self.command[:3]
-        way = np.clip(values[:3], *np.transpose(REACH)) - before
-        way *= min(1.0, FASTEST / max(float(np.linalg.norm(way)), 1e-9))
+        move = np.clip(values[:3], *np.transpose(REACH)) - before
+        move *= min(1.0, FASTEST / max(float(np.linalg.norm(move)), 1e-9))
         opening = OPEN if values[3] > THRESHOLD else 0.0
-        self.command = np.array([*(before + way), opening])
+        self.command = np.array([*(before + move), opening])
         robot, mode, drive = self.bodies.robot, pybullet().POSITION_CONTROL, self.client.setJointMotorControlArray
         drive(robot, FINGERS, mode, targetPositions=[opening / 2] * 2, forces=[FORCE] * 2)
         strength = {"forces": [87.0] * 4 + [12.0] * 3, "positionGains": [GAIN] * len(ARM)}
         for part in range(1, TARGETS + 1):
-            drive(robot, ARM, mode, targetPositions=self._angles(before + way * part / TARGETS), **strength)
+            drive(robot, ARM, mode, targetPositions=self._angles(before + move * part / TARGETS), **strength)
             for _ in range(SUBSTEPS):
                 self.client.stepSimulation()
         self._steps += 1
@@ -215,7 +215,7 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
     def _info(self) -> dict[str, Any]:
         places, hand = self.places(), self.hand()
         circle = places[CIRCLE]
-        left = hand[7] > THRESHOLD and hand[2] > circle[2] + AWAY
+        released = hand[7] > THRESHOLD and hand[2] > circle[2] + AWAY
         moved = float(np.linalg.norm(places[BOOK] - self._first[BOOK])) if BOOK in places else 0.0
         return {
             "circle": circle,
@@ -225,7 +225,7 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
             "touched": TRIANGLE in self._touched,
             "touches": frozenset(self._touched),
             "lifted": self._lifted,
-            "released": bool(left and np.linalg.norm(circle - self._before) < STILL and self._steps),
+            "released": bool(released and np.linalg.norm(circle - self._before) < STILL and self._steps),
             "trace": self._trace,
         }
 

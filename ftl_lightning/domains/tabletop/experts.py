@@ -37,11 +37,11 @@ Place = NDArray[np.float64]
 WIDEST = 0.8  # Maximum angle in radians of a pushing hand from the line behind the circle, seen from the circle
 FARTHEST = 0.12  # Maximum distance in metres of a pushing hand from the circle's centre
 STEERING = 3.0
-"""Deviation of the hand's direction from the circle's, per radian of the hand's angle; above 1, it returns to the line behind."""
+"""Steering gain: turn of the hand's direction per radian of its angle; above 1, the hand returns to the line behind the circle."""
 LOW = 0.006  # Height in metres above push height below which a hand is low
 CLEAR = 0.065  # Travel height in metres above push height, above all objects
 NEAR, FUNNEL = 0.015, 0.03
-"""Metres from the point of descent: radius in which the hand may be low (above the spread between demonstrations), and funnel."""
+"""Radius in metres around the point of descent in which the hand may be low, and width of the ring in which it descends."""
 ACROSS, DOWN, UP = 0.016, 0.011, 0.014  # Maximum metres per step sideways, down and up
 AHEAD = 0.05  # Distance in metres of the circle's next goal on the path around the bowl
 
@@ -77,13 +77,13 @@ def pushed(hand: Place, circle: Place, goal: Place, manner: Manner) -> Place:
 
 def _travelled(hand: Place, begin: Place, manner: Manner) -> Place:
     """Next position of a hand that descends at ``begin`` ``(2,)``: up first, down only above it."""
-    off = begin - hand[:2]
-    away = float(np.linalg.norm(off))
-    wanted = manner.height + CLEAR * min(1.0, max(0.0, (away - NEAR) / FUNNEL))
-    free = min(1.0, max(0.0, 1 - (wanted - hand[2]) / FUNNEL))  # a low hand rises before it moves
-    step = min(away, free * min(ACROSS * manner.haste, 0.35 * away + 0.0005))
-    rise = float(np.clip(wanted - hand[2], -DOWN * manner.haste, UP * manner.haste))
-    return np.array([*(hand[:2] + step * off / max(away, 1e-9)), hand[2] + rise])
+    offset = begin - hand[:2]
+    distance = float(np.linalg.norm(offset))
+    target = manner.height + CLEAR * min(1.0, max(0.0, (distance - NEAR) / FUNNEL))
+    free = min(1.0, max(0.0, 1 - (target - hand[2]) / FUNNEL))  # a low hand rises before it moves
+    step = min(distance, free * min(ACROSS * manner.haste, 0.35 * distance + 0.0005))
+    rise = float(np.clip(target - hand[2], -DOWN * manner.haste, UP * manner.haste))
+    return np.array([*(hand[:2] + step * offset / max(distance, 1e-9)), hand[2] + rise])
 
 
 def around(circle: Place, goal: Place, bowl: Place) -> Place:
@@ -91,8 +91,8 @@ def around(circle: Place, goal: Place, bowl: Place) -> Place:
     line = goal - circle
     distance = max(float(np.linalg.norm(line)), 1e-6)
     along = line / distance
-    off = bowl - circle
-    beside, passed = float(along[0] * off[1] - along[1] * off[0]), float(along @ off)
+    offset = bowl - circle
+    beside, passed = float(along[0] * offset[1] - along[1] * offset[0]), float(along @ offset)
     if abs(beside) >= RING or not 0 < passed < distance:
         return goal
     side = 1.0 if beside > 0 else -1.0  # counter-clockwise is 1
@@ -107,13 +107,13 @@ def around(circle: Place, goal: Place, bowl: Place) -> Place:
 
 def _tangent(centre: Place, place: Place, turn: float) -> float:
     """Angle on the ring around a centre of the tangent from a point."""
-    off = place - centre
-    distance = max(float(np.linalg.norm(off)), RING + 1e-6)
-    return math.atan2(off[1], off[0]) - turn * math.acos(RING / distance)
+    offset = place - centre
+    distance = max(float(np.linalg.norm(offset)), RING + 1e-6)
+    return math.atan2(offset[1], offset[0]) - turn * math.acos(RING / distance)
 
 
-PAST = 8  # Steps that a push continues after success: small position errors must not stop a policy before the triangle
-STAY = 4  # Steps of rest after a task, so that plans end at rest
+PAST = 8  # Steps of a push after success: a policy with small position errors must not stop before the triangle
+STAY = 4  # Steps at rest after a task, so that plans end at rest
 CLOSED = 0.0
 PUSH_HEIGHT = 0.014  # Hand height in metres above the surface under the circle during a push
 GRASP_HEIGHT = 0.016
@@ -125,13 +125,13 @@ TREMBLE = 0.0003  # Standard deviation of the hand noise per step, in metres
 SLIPS, SLIP = 0.04, (0.006, 0.018)
 """Slip probability per step of a push, and range of sizes in metres: recovery is learned from slips (Laskey et al., 2017)."""
 RETURN = 0.8  # Share of the hand's deviation from its path that remains a step later
-MISLAID = 0.6  # Recoveries: probability that the circle is moved
+MISLAID = 0.6  # Recoveries: probability that the circle is displaced
 LYING, RISING, OVER = 0.5, 0.4, 0.03
-"""Recoveries: probability of a low hand; that any other is beside the circle; minimum metres above push height of one over it."""
+"""Recoveries: probability of a low hand; of a higher hand beside the circle; else minimum metres above push height, over it."""
 ASTRAY, REACHED = ((0.32, 0.70), (-0.28, 0.28)), ((0.26, 0.77), (-0.35, 0.35))  # Recoveries: x and y ranges of circle and hand
 OPENED, HIGHEST = 0.5, 0.16  # Recoveries of picks: probability of an open hand, and maximum hand height in metres above push height
-AROUND, ROOM, FARTHEST_PUSH = (0.034, 0.08), 0.012, 0.33
-"""Recoveries, in metres: range from hand to circle; minimum gap between circle and others; maximum from circle to push target."""
+AROUND, ROOM, LONGEST_PUSH = (0.034, 0.08), 0.012, 0.33
+"""Recoveries, in metres: range from hand to circle, minimum gap from circle to other objects, maximum from circle to target."""
 APART_FROM = 0.12  # Centre distance in metres between an object and the circle placed beside it; leaves room for open fingers
 
 Moves = Generator[Place, None, None]  # Commands (4,) per step: x, y, z and gripper opening
@@ -146,7 +146,7 @@ class Style:
     aside: float
     hover: float  # travel height in metres
     grasp: Place  # x and y of the grasp relative to the circle's centre, in metres
-    place: Place  # x and y of the final position relative to the goal, as a fraction (-1..1) of the allowed spread
+    release: Place  # x and y of the final position relative to the goal, -1 to 1 times the spread of the task
 
 
 def style(rng: np.random.Generator) -> Style:
@@ -157,7 +157,7 @@ def style(rng: np.random.Generator) -> Style:
         aside=float(rng.uniform(-ASIDE, ASIDE)),
         hover=float(rng.uniform(0.11, 0.16)),
         grasp=rng.uniform(-0.004, 0.004, 2),
-        place=rng.uniform(-1, 1, 2),
+        release=rng.uniform(-1, 1, 2),
     )
 
 
@@ -230,12 +230,12 @@ def _target(expert: _Expert) -> tuple[Place, float]:
     scene, how = expert.env.scene, expert.how
     if expert.task in (TO_BOOK, TO_WHITE):
         name, spread = (BOOK, 0.02) if expert.task == TO_BOOK else (WHITE, 0.012)
-        return scene[COLUMNS[name]][1:3].astype(np.float64) + spread * how.place, HEIGHT[name]
+        return scene[COLUMNS[name]][1:3].astype(np.float64) + spread * how.release, HEIGHT[name]
     # The side of the object where the circle lay, which is invariant to rotations of the scene.
     thing = scene[COLUMNS[TARGET[expert.task]]][1:3].astype(np.float64)
     along = expert.circle()[:2] - thing
     along /= np.linalg.norm(along)
-    return thing + (APART_FROM + 0.005 * how.place[0]) * along + 0.01 * how.place[1] * np.array([-along[1], along[0]]), 0.0
+    return thing + (APART_FROM + 0.005 * how.release[0]) * along + 0.01 * how.release[1] * np.array([-along[1], along[0]]), 0.0
 
 
 def _push(expert: _Expert, height: float) -> Moves:
@@ -265,9 +265,9 @@ def _straight(expert: _Expert, height: float) -> Moves:
 
 
 def led_astray(env: "TableTopEnvironment", task: str, rng: np.random.Generator) -> dict[str, NDArray[Any]]:
-    """Start a recovery from a failure: the hand on any side of the circle, low or above it, open or closed and empty in picks.
+    """Start a recovery from a failure: the hand on any side of the circle, low or above it; in picks empty, open or closed.
 
-    With probability :data:`MISLAID` the circle lies elsewhere, also outside its initial range. Open hands are above it.
+    With probability :data:`MISLAID` the circle is displaced, also outside its initial range. Open hands are above the circle.
     """
     circle, others = env.places()[CIRCLE], {name: env.outline(name) for name in env.bodies.objects if name != CIRCLE}
     below, picks = support(env.scene, CIRCLE), task not in PUSHES
@@ -286,6 +286,6 @@ def led_astray(env: "TableTopEnvironment", task: str, rng: np.random.Generator) 
         height = below + PUSH_HEIGHT + (0.0 if low else rng.uniform(0, OVER) if rising else rng.uniform(OVER, highest))
         finger = outline(CIRCLE, float(hand[0]), float(hand[1]), 0.0)
         free = all(gap(shape, obstacle) >= ROOM and gap(finger, obstacle) >= APART for obstacle in others.values())
-        far = not picks and np.linalg.norm(place - env.places()[TARGET[task]][:2]) > FARTHEST_PUSH
-        if free and not far and all(low < value < high for value, (low, high) in zip(hand, REACHED, strict=True)):
+        too_far = not picks and np.linalg.norm(place - env.places()[TARGET[task]][:2]) > LONGEST_PUSH
+        if free and not too_far and all(low < value < high for value, (low, high) in zip(hand, REACHED, strict=True)):
             return env.put(np.array([*hand, height]), place, OPEN if opened else CLOSED)

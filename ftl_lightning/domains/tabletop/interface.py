@@ -36,16 +36,16 @@ class Camera:
         """Image ``(height, width, 3)`` of pybullet's software renderer."""
         height, width = self.size
         options = {"lightDirection": [0.3, -0.6, 1.5], "shadow": int(shadow), "renderer": pybullet().ER_TINY_RENDERER}
-        seen = client.getCameraImage(width, height, *self._matrices(), **options)
-        rgba: NDArray[np.uint8] = np.asarray(seen[2], dtype=np.uint8).reshape(height, width, 4)
+        image = client.getCameraImage(width, height, *self._matrices(), **options)
+        rgba: NDArray[np.uint8] = np.asarray(image[2], dtype=np.uint8).reshape(height, width, 4)
         return np.ascontiguousarray(rgba[..., :3])
 
     def pixels(self, places: NDArray[np.float64]) -> NDArray[np.float64]:
         """Column and row ``(n, 2)`` of points ``(n, 3)`` in an image."""
         view, lens = (np.array(matrix).reshape(4, 4).T for matrix in self._matrices())
         clip = np.concatenate((places, np.ones((len(places), 1))), axis=-1) @ (lens @ view).T
-        seen = clip[:, :2] / clip[:, 3:]
-        return (np.array([1, 1]) + seen * (1, -1)) / 2 * (self.size[1], self.size[0])
+        device = clip[:, :2] / clip[:, 3:]
+        return (np.array([1, 1]) + device * (1, -1)) / 2 * (self.size[1], self.size[0])
 
 
 OVERHEAD = Camera((0.5, 0.0, 0.85), (0.5, 0.0, 0.0), (1.0, 0.0, 0.0), 45.0, (64, 64))  # Camera of the model
@@ -64,7 +64,7 @@ ACTION = 4  # Size of an action: position of the hand (m) and opening of the gri
 HERTZ = 10  # Actions per second
 MAX_STEPS = 160  # Maximum steps per episode, as in the paper: 16 seconds
 OPEN, THRESHOLD = 0.08, 0.06
-"""Opening of an open gripper in metres, and threshold above which an action opens the gripper instead of closing it."""
+"""Opening of an open gripper, and opening above which an action opens the gripper, else it closes; in metres."""
 
 
 def check_simulator() -> None:
@@ -96,8 +96,8 @@ SUITES = {
     "representation": Suite((EvaluationTask("training representation", PUSH_ON_BOOK, texts=(PUSH,)),)),
     "validation": Suite((EvaluationTask("new concept", BESIDE_BOWL, (BESIDE_BOWL,)),)),
 }
-"""The validation task is of another kind, so that nothing is tuned on the evaluation task. ``representation`` is the paper's
-baseline: scenes of the new task with the text of the push on the table."""
+"""``validation`` is a pick, so that no setting is tuned on the evaluated push. ``representation`` is the paper's baseline: scenes
+of the new task with the text of the push on the table."""
 WIDE_SUITES = {
     "training": training_suite(WIDE_CONCEPTS),
     "paper": SUITES["paper"],
@@ -115,11 +115,11 @@ def check_task(task: str) -> str:
 
 HAND, POINTS, MOVED = "hand", "points", "moved"
 ORIGIN = "origin"
-"""Feature of the hand position in the image: column and row, -1..1, with the view ``hand``; x and y from the centre, in half
-images, with ``points``."""
+"""Observed hand position in the image. View ``hand``: column and row, -1 to 1; view ``points``: x and y from the image centre, in
+half images."""
 SHIFT = 0.07  # Maximum shift of a scene in metres, in x and in y
 RAISED = 0.05  # Maximum elevation in metres of half of the scenes without image, so that pushes and picks generalise to any surface
-TURN = 0.5  # Maximum rotation in radians of half of the scenes; others are rotated by any angle
+TURN = 0.5  # Maximum rotation in radians of half of the scenes; the other half is rotated by any angle
 BLUR = (0.004, 0.004, 0.002)  # Standard deviation of the errors of an image encoder on new scenes, in metres, in x, y and height
 SURE = 6.0  # Visibility logit of a confident encoder
 HALF = OVERHEAD.eye[2] * math.tan(math.radians(OVERHEAD.angle) / 2)  # Metres of the table from the centre of an image to its edge
@@ -157,15 +157,15 @@ def moved(states: Tensor, observed: Observed, mirrored: Tensor, angles: Tensor, 
         image = functional.grid_sample(observed[IMAGE].float(), grid, padding_mode="border", align_corners=False)
         result[IMAGE] = image.round().to(torch.uint8)
     if PLACES in observed:
-        seen, centres = observed[PLACES].split((1, 3), dim=-1)
+        visible, centres = observed[PLACES].split((1, 3), dim=-1)
         centres = places(centres)
-        shown = ((centres[..., :2] - middle).abs() < HALF).all(dim=-1, keepdim=True)
-        result[PLACES] = torch.cat((seen * shown, centres), dim=-1)
+        inside = ((centres[..., :2] - middle).abs() < HALF).all(dim=-1, keepdim=True)
+        result[PLACES] = torch.cat((visible * inside, centres), dim=-1)
     return places(states), result
 
 
 def raised(states: Tensor, observed: Observed, heights: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-    """Raise the table by heights ``(sample,)`` in metres: states, ``pose`` and ``places``. Images from above would not show it."""
+    """Raise the table by heights ``(sample,)`` in metres: states, ``pose`` and ``places``, not images."""
     states, pose, places = states.clone(), observed[POSE].clone(), observed[PLACES].clone()
     pose[:, 2] += heights
     places[..., 3] += heights[:, None]
@@ -173,36 +173,37 @@ def raised(states: Tensor, observed: Observed, heights: Tensor) -> tuple[Tensor,
     return states, {**observed, POSE: pose, PLACES: places}
 
 
-def misplaced(read: Tensor, places: Tensor) -> Tensor:
-    """Loss of keypoints of an image encoder ``(sample,)``.
+def keypoint_loss(keypoints: Tensor, places: Tensor) -> Tensor:
+    """Loss of an image encoder's keypoints ``(sample,)``.
 
-    Absolute errors of the centres of visible objects, in half images, plus .01 times the cross-entropy of visibility.
+    L1 error of the centres of visible objects, in half images, plus .01 times the cross-entropy of visibility.
 
     Args:
-        read: x, y, height and visibility logit of each object, all x first ``(sample, 20)``; see :class:`.ImageEncoder`.
+        keypoints: x, y, height and visibility logit of each object, all x first ``(sample, 20)``; see :class:`.ImageEncoder`.
         places: :data:`SEEN` ``(sample, 5, 4)``.
     """
-    read, seen = read.unflatten(1, (4, -1)).transpose(1, 2), places[..., 0]
-    off = read[..., :3] - (places[..., 1:] - places.new_tensor((*MIDDLE, 0.0))) / HALF
-    unseen = functional.binary_cross_entropy_with_logits(read[..., 3], seen, reduction="none")
-    return (off.abs().sum(dim=-1) * seen + 0.01 * unseen).sum(dim=-1)
+    keypoints, visible = keypoints.unflatten(1, (4, -1)).transpose(1, 2), places[..., 0]
+    error = keypoints[..., :3] - (places[..., 1:] - places.new_tensor((*MIDDLE, 0.0))) / HALF
+    entropy = functional.binary_cross_entropy_with_logits(keypoints[..., 3], visible, reduction="none")
+    return (error.abs().sum(dim=-1) * visible + 0.01 * entropy).sum(dim=-1)
 
 
-def told(places: Tensor, draw: torch.Generator) -> Tensor:
-    """Simulate the keypoints of an image encoder, in the form of :func:`misplaced`: visible centres with errors of :data:`BLUR`."""
-    seen, centres = places[..., :1], places[..., 1:] - places.new_tensor((*MIDDLE, 0.0))
-    wrong = drawn(len(centres), lambda n: torch.randn((n, *centres.shape[1:]), generator=draw, device=centres.device))
-    wrong = wrong * centres.new_tensor(BLUR)
-    return torch.cat((seen * (centres + wrong) / HALF, SURE * (2 * seen - 1)), dim=-1).transpose(1, 2).flatten(1)
+def noisy_keypoints(places: Tensor, draw: torch.Generator) -> Tensor:
+    """Simulate keypoints of an image encoder, as of :func:`keypoint_loss`: true centres plus normal noise of :data:`BLUR`."""
+    visible, centres = places[..., :1], places[..., 1:] - places.new_tensor((*MIDDLE, 0.0))
+    noise = drawn(len(centres), lambda n: torch.randn((n, *centres.shape[1:]), generator=draw, device=centres.device))
+    noise = noise * centres.new_tensor(BLUR)
+    return torch.cat((visible * (centres + noise) / HALF, SURE * (2 * visible - 1)), dim=-1).transpose(1, 2).flatten(1)
 
 
 def _perturb(states: Tensor, observed: Observed, draw: torch.Generator | None) -> tuple[Tensor, Observed]:
     if draw is None:  # no transformation of new tasks
         return states, observed
     count, device = len(states), states.device
-    way = drawn(count, lambda n: torch.rand((n, 5), generator=draw, device=device))
-    most = torch.where(way[:, 1] < 0.5, TURN, math.pi)
-    states, observed = moved(states, observed, way[:, 0] < 0.5, most * (2 * way[:, 2] - 1), SHIFT * (2 * way[:, 3:] - 1))
+    uniform = drawn(count, lambda n: torch.rand((n, 5), generator=draw, device=device))
+    most = torch.where(uniform[:, 1] < 0.5, TURN, math.pi)
+    angles, shifts = most * (2 * uniform[:, 2] - 1), SHIFT * (2 * uniform[:, 3:] - 1)
+    states, observed = moved(states, observed, uniform[:, 0] < 0.5, angles, shifts)
     if IMAGE in observed:
         return states, observed
     height = drawn(count, lambda n: torch.rand(n, generator=draw, device=device))
@@ -241,5 +242,5 @@ VIEWS = {
         same_columns=True,
     ),
 }
-"""``hand`` has states relative to the hand; keypoints of images can be relative too, see :data:`ORIGIN`. ``points`` is the same for
-encoders of x and y of objects. ``moved`` has absolute states."""
+"""All views augment scenes. States are relative to the hand in ``hand`` and ``points``, absolute in ``moved``. ``points`` is for
+image encoders with x and y of objects. Keypoints can be relative to the hand, see :data:`ORIGIN`."""

@@ -52,7 +52,7 @@ def _table(axes: Axes, plan: NDArray[np.float32], scene: NDArray[np.float32] | N
 
 
 def film(rollout: Rollout, plans: Tensor) -> list[NDArray[np.uint8]]:
-    """Front views ``(240, 320, 3)`` of an episode, at most :data:`FRAMES`, with the current of ``plans (step, horizon, 4)``."""
+    """Front views ``(240, 320, 3)`` of an episode, at most :data:`FRAMES`, with the plan of each step ``(step, horizon, 4)``."""
     check_simulator()
     from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
 

@@ -83,16 +83,16 @@ def _normals(points: Points) -> Points:
     return np.stack((along[:, 1], -along[:, 0]), axis=-1) / np.linalg.norm(along, axis=-1, keepdims=True)
 
 
-def gap(one: Points, other: Points) -> float:
-    """Gap between two outlines in metres; a lower bound between corners, negative for overlap."""
-    pairs = ((one, other, _normals(one)), (other, one, _normals(other)))
+def gap(first: Points, second: Points) -> float:
+    """Gap between convex outlines in metres: negative for overlap, a lower bound of the distance between corners."""
+    pairs = ((first, second, _normals(first)), (second, first, _normals(second)))
     return float(max(((b @ normals.T).min(axis=0) - (a @ normals.T).max(axis=0)).max() for a, b, normals in pairs))
 
 
-def within(one: Points, other: Points) -> bool:
+def within(inner: Points, outer: Points) -> bool:
     """Whether an outline lies inside another."""
-    normals = _normals(other)
-    return bool(((one @ normals.T).max(axis=0) <= (other @ normals.T).max(axis=0) + 1e-9).all())
+    normals = _normals(outer)
+    return bool(((inner @ normals.T).max(axis=0) <= (outer @ normals.T).max(axis=0) + 1e-9).all())
 
 
 def outlines(scene: NDArray[np.float32]) -> dict[str, Points]:

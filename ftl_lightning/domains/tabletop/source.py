@@ -43,10 +43,10 @@ _SETTINGS = {
 
 @dataclass(frozen=True)
 class Episode:
-    """Episode of an expert."""
+    """Recorded episode of an expert."""
 
     commands: NDArray[np.float32]  # (time, 4), executed; the first is the initial state
-    actions: NDArray[np.float32]  # (steps, 4), passed to the environment, which shortens moves that are too far
+    actions: NDArray[np.float32]  # (steps, 4), passed to the environment, which shortens long moves
     images: NDArray[np.uint8]  # (time, 3, 64, 64)
     poses: NDArray[np.float32]  # (time, 8), measured
     success: bool  # whether the task is done
@@ -103,23 +103,23 @@ def perform(
         scatter: whether to move distractors in each image, see :func:`scattered`.
         begin: change of the scene before the demonstration, such as :func:`led_astray`; ``None`` for no change.
     """
-    seen, info = env.reset(options={"scene": scene})
+    observation, info = env.reset(options={"scene": scene})
     if begin is not None:
-        seen = begin(env, task, rng)
+        observation = begin(env, task, rng)
     how = style(rng)
-    commands, images, poses = [env.command.copy()], [seen[IMAGE]], [seen[POSE]]
+    commands, images, poses = [env.command.copy()], [observation[IMAGE]], [observation[POSE]]
     actions: list[NDArray[np.float32]] = []
     ended, success = None, False
     for command in moves(env, task, how, height, feedback):
-        off = TREMBLE * rng.standard_normal(3)
+        noise = TREMBLE * rng.standard_normal(3)
         angle, size, slips = rng.uniform(-math.pi, math.pi), rng.uniform(*SLIP), rng.random() < SLIPS
         if slips and task in PUSHES and feedback:  # no recovery without feedback
-            off[:2] += size * np.array([math.cos(angle), math.sin(angle)])
-        actions.append((command + np.array([*off, 0.0])).astype(np.float32))
-        seen, _, terminated, truncated, info = env.step(actions[-1])
+            noise[:2] += size * np.array([math.cos(angle), math.sin(angle)])
+        actions.append((command + np.array([*noise, 0.0])).astype(np.float32))
+        observation, _, terminated, truncated, info = env.step(actions[-1])
         commands.append(env.command.copy())
-        images.append(seen[IMAGE])
-        poses.append(seen[POSE])
+        images.append(observation[IMAGE])
+        poses.append(observation[POSE])
         done = judged(task, env.scene, info)
         if ended is None and (terminated or truncated or (done and task in PUSHES)):
             ended, success = len(actions), done
@@ -260,7 +260,7 @@ def initial_states(drawn: torch.Tensor) -> InitialStates:
     """Scenes ``(scene, 24)`` and their initial observations."""
     env = TableTopEnvironment()
     try:
-        seen = [env.reset(options={"scene": scene.numpy()})[0] for scene in drawn]
+        observations = [env.reset(options={"scene": scene.numpy()})[0] for scene in drawn]
     finally:
         env.close()
-    return InitialStates({name: torch.from_numpy(np.stack([row[name] for row in seen])) for name in FEATURES}, drawn)
+    return InitialStates({name: torch.from_numpy(np.stack([row[name] for row in observations])) for name in FEATURES}, drawn)

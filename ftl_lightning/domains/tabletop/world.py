@@ -98,8 +98,8 @@ def _box(
 ) -> int:
     half = [edge / 2 for edge in size]
     shape = client.createCollisionShape(pybullet().GEOM_BOX, halfExtents=half)
-    seen = client.createVisualShape(pybullet().GEOM_BOX, halfExtents=half, rgbaColor=[*colour, 1])
-    body: int = client.createMultiBody(mass, shape, seen, place, turned(yaw))
+    visual = client.createVisualShape(pybullet().GEOM_BOX, halfExtents=half, rgbaColor=[*colour, 1])
+    body: int = client.createMultiBody(mass, shape, visual, place, turned(yaw))
     client.changeDynamics(body, -1, lateralFriction=friction)
     return body
 
@@ -113,22 +113,22 @@ def _object(client: Simulator, scene: NDArray[np.float32], name: str, edged: boo
         return _box(client, (*SIZE[name], height), place, COLOUR[name], MASS[name], FRICTION[name], yaw)
     if name == CIRCLE:
         shape = client.createCollisionShape(pybullet().GEOM_CYLINDER, radius=RADIUS[name], height=height)
-        seen = client.createVisualShape(pybullet().GEOM_CYLINDER, radius=RADIUS[name], length=height, rgbaColor=colour)
+        visual = client.createVisualShape(pybullet().GEOM_CYLINDER, radius=RADIUS[name], length=height, rgbaColor=colour)
         if edged:
             drawn = _edged(_corners(RADIUS[name], height / 2, ROUND))
-            seen = client.createVisualShape(pybullet().GEOM_MESH, **drawn, rgbaColor=colour)
+            visual = client.createVisualShape(pybullet().GEOM_MESH, **drawn, rgbaColor=colour)
     elif name == TRIANGLE:
         vertices = _corners(RADIUS[name] - 2 * MARGIN, height / 2 - MARGIN, 3).tolist()  # corners move twice as far as sides
         shape = client.createCollisionShape(pybullet().GEOM_MESH, vertices=vertices)
         smooth: dict[str, list[Any]] = {"vertices": _corners(RADIUS[name], height / 2, 3).tolist(), "indices": _PRISM_SIDES}
         drawn = _edged(_corners(RADIUS[name], height / 2, 3)) if edged else smooth
-        seen = client.createVisualShape(pybullet().GEOM_MESH, **drawn, rgbaColor=colour)
+        visual = client.createVisualShape(pybullet().GEOM_MESH, **drawn, rgbaColor=colour)
     else:
         shape = _bowl_shape(client)
         vertices, triangles = bowl(RADIUS[name], height / 2, 0.006)
         upright = [[a, -c, b] for a, b, c in vertices]  # from y up to z up
-        seen = client.createVisualShape(pybullet().GEOM_MESH, vertices=upright, indices=triangles, rgbaColor=colour)
-    body: int = client.createMultiBody(MASS[name], shape, seen, place, turned(yaw))
+        visual = client.createVisualShape(pybullet().GEOM_MESH, vertices=upright, indices=triangles, rgbaColor=colour)
+    body: int = client.createMultiBody(MASS[name], shape, visual, place, turned(yaw))
     client.changeDynamics(body, -1, lateralFriction=FRICTION[name])
     if name == TRIANGLE:
         client.changeDynamics(body, -1, collisionMargin=MARGIN)

@@ -69,5 +69,5 @@ class VAEModel(AdditiveModel):
         shape, (together, row) = (count, self.config.concept_dim), batched(compositions, count, generators)
         noise = torch.cat([torch.randn(shape, generator=draw, device=draw.device) for draw in generators]).to(self.device)
         z = added(together)[row] + sampling.temperature**0.5 * noise
-        seen = observed or {}
-        return self.decode(self.plans(z, seen), seen).unflatten(0, (len(compositions), count))
+        features = observed or {}
+        return self.decode(self.plans(z, features), features).unflatten(0, (len(compositions), count))

@@ -52,10 +52,10 @@ class Codes:
         fixed = generator("cpu", zlib.crc32(b"codes"))
         mixing = torch.randn(clean.shape[2], self.size, generator=fixed).to(device)
         directions = torch.randn(self.size, width, generator=fixed).to(device) / self.size**0.5
-        shown = clean[:, times] - clean[:, :1] if self.relative else clean[:, times]
-        way = shown @ mixing  # (batch, knot, size)
-        numbers = way / mean(way.square().mean()).sqrt().clamp(min=1e-6)
-        numbers = numbers + self.noise * drawn(count, lambda n: torch.randn((n, *way.shape[1:]), generator=draw, device=device))
+        states = clean[:, times] - clean[:, :1] if self.relative else clean[:, times]
+        path = states @ mixing  # (batch, knot, size)
+        numbers = path / mean(path.square().mean()).sqrt().clamp(min=1e-6)
+        numbers = numbers + self.noise * drawn(count, lambda n: torch.randn((n, *path.shape[1:]), generator=draw, device=device))
         coded = (drawn(count, lambda n: torch.rand(n, generator=draw, device=device)) < self.share) & ~removed
         alone = coded & (drawn(count, lambda n: torch.rand(n, generator=draw, device=device)) < 0.5)
         text = torch.where(alone[:, None], 0, texts)  # 0 is the mean of the training concepts

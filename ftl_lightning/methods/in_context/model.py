@@ -96,18 +96,18 @@ class InContextModel(ConceptModel):
         rows = torch.arange(len(demonstrations)).repeat_interleave(tokens)
         starts = (stride * torch.arange(tokens)).repeat(len(demonstrations))
         states, observed = demonstrations.windows(rows, starts.minimum(demonstrations.lengths[rows] - 1), self.window)
-        seen: Observed = moved(observed, self.device)
+        features: Observed = moved(observed, self.device)
         states = states.to(self.device)
         if perturbed and self._perturb is not None:
-            states, seen = self._perturb(states, seen, None)
-        read = torch.cat((self.present_vector(seen), self.encode(states[:, ::stride], seen)[:, -1]), dim=-1)
-        return read.unflatten(0, (-1, tokens)).flatten(1).cpu()
+            states, features = self._perturb(states, features, None)
+        states_read = torch.cat((self.present_vector(features), self.encode(states[:, ::stride], features)[:, -1]), dim=-1)
+        return states_read.unflatten(0, (-1, tokens)).flatten(1).cpu()
 
     def present_vector(self, observed: Observed) -> Tensor:
         """Normalised observation ``(batch, m)``, see :meth:`vector`; ``UserError`` for a domain without observed features."""
         if (vector := self.vector(observed)) is None:
             raise UserError(
-                f"domain: expected one with observed features, found {self.domain.name}: there is no present to go on from"
+                f"domain: expected a domain with observed features, found {self.domain.name}: there is no present to go on from"
             )
         return vector
 
@@ -122,8 +122,8 @@ class InContextModel(ConceptModel):
 
     def follow(self, memory: Tensor, given: Tensor, observed: Tensor) -> Tensor:
         """Logits ``(group, query, state, bin)`` of the states after ``observed (group, query, m)``; queries are independent."""
-        apart = ~torch.eye(observed.shape[1], dtype=torch.bool, device=observed.device)
-        out = self.decoder(self.present(observed), memory, tgt_mask=apart, memory_key_padding_mask=self._missing(given))
+        others = ~torch.eye(observed.shape[1], dtype=torch.bool, device=observed.device)
+        out = self.decoder(self.present(observed), memory, tgt_mask=others, memory_key_padding_mask=self._missing(given))
         return self.head(out).unflatten(-1, (self.config.state_dim, self.config.bins))
 
     def bins(self, normalised: Tensor) -> Tensor:

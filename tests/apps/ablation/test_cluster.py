@@ -243,7 +243,7 @@ def test_a_cluster_that_is_none_is_told_in_one_line(
     nothing = "address: expected the head of a Ray cluster at 127.0.0.1:9, found that nothing answers there"
     for address, told in (
         ("127.0.0.1:9", nothing),
-        ("ray://head:10001", "address: expected HOST:PORT of a cluster's head, and ablate called on one of its machines"),
+        ("ray://head:10001", "address: expected HOST:PORT of a cluster's head, and ablate called on a machine of the cluster"),
         ("auto", "address: expected a Ray cluster that this machine is a node of, found none; start it by: ray start"),
     ):
         with pytest.raises(UserError, match=told), cluster.cluster(address, attempts.attempt):

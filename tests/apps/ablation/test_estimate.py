@@ -37,7 +37,7 @@ def test_a_cell_is_measured_by_itself_or_else_by_its_nearest() -> None:
 def test_an_estimate_says_what_it_does_not_know() -> None:
     first, *_ = plan = cells(0, 1)
     assert estimate([[]], {}, 4) == ["4 cells: 4 need not be run, 0 to run"]
-    assert "not known, as no cell like them was measured" in estimate([plan], {}, 4)[-1]
+    assert "not known, as no similar cell was measured" in estimate([plan], {}, 4)[-1]
     other = next(Stage("fit", "a.yaml").cells(0))
     lines = estimate([[other], plan], {first.name: CellRecord("done", first.configs, seconds=3600)}, 9)
     assert lines == [

@@ -292,8 +292,11 @@ def test_data_are_written_with_cards_and_hashes(form: str) -> None:
         (["replay", "--suites", "beats", "--seeds", "0,x"], "seeds: expected different numbers"),
         (["replay", "--suites", "beats", "--seeds", "1,1"], "seeds: expected different numbers"),
         (["language", "--suites", "beats"], "model: expected models of kind diffusion, which language does not pretrain"),
-        (["bc", "--suites", "pictures,beats"], "suite beats: method BC: domain: expected one with observed features"),
-        (["in_context", "--suites", "pictures"], "suite pictures: method in-context: domain: expected one with observed features"),
+        (["bc", "--suites", "pictures,beats"], "suite beats: method BC: domain: expected a domain with observed features"),
+        (
+            ["in_context", "--suites", "pictures"],
+            "suite pictures: method in-context: domain: expected a domain with observed features",
+        ),
         (["nobody", "--suites", "beats"], "method: expected one of ftl_igm"),
         (["replay", "--suites", "beats", "--model", "absent/{suite}"], "expected a pretrained model for suite beats, found none"),
         (["replay", "--suites", "beats", "--configurations", "absent"], "expected beats.yaml or suites.yaml in absent"),
@@ -313,4 +316,4 @@ def test_suites_that_a_method_cannot_do_are_left_out_and_told(capsys: pytest.Cap
     assert main(["benchmark", "bc", "--skip", "agent,driving,object_rearrangement,pictures,tabletop"]) == 2
     told = [line for line in capsys.readouterr().err.splitlines() if line.startswith("note: left out: suite ")]
     assert [line.split()[4] for line in told] == ["beats:", "mocap:", "reaches:", "strokes:"]
-    assert all("method BC: domain: expected one with observed features" in line for line in told if "mocap" not in line)
+    assert all("method BC: domain: expected a domain with observed features" in line for line in told if "mocap" not in line)
