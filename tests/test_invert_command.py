@@ -9,6 +9,7 @@ import torch
 
 from ftl_lightning import Demonstrations, FewShot
 from ftl_lightning.data.demonstrations import concatenate
+from ftl_lightning.evaluation.results import read_rows
 from ftl_lightning.services.errors import UserError
 from tests.conftest import CONF, refused, succeed
 from tests.tiny import QUIET
@@ -47,6 +48,15 @@ def test_it_writes_and_prints_what_the_trainer_does(model: Path, file: Path, cap
     assert [line.partition(":")[0] for line in printed[1::2]] == ["  quality"] * len(GOALS)
     assert {line.replace("own/", "trained/") for line in printed} <= {*by_trainer}
     assert "learning 2 concepts: 5 steps" in without.err
+
+
+@pytest.mark.parametrize(("options", "form"), [([], "form chosen"), (["--model.form=paper"], "")])
+def test_rows_name_the_form_that_was_learned(model: Path, file: Path, options: list[str], form: str) -> None:
+    quick = ["--data.steps=2", "--evaluation.samples=1", "--evaluation.steps=2", "--evaluation.figures=0"]
+    quick += ["--evaluation.diversity=false", "--evaluation.results=rows.csv", *QUIET, *options]
+    trained = ["invert", f"--config={CONF / 'object_rearrangement.yaml'}", f"--model.pretrained={model}"]
+    succeed(*trained, f"--data.demonstrations={file}", *quick)
+    assert set(read_rows(Path("rows.csv"))["form"]) == {form}
 
 
 def test_faults_of_demonstrations_are_noted(model: Path, capfd: pytest.CaptureFixture[str]) -> None:

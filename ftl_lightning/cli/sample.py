@@ -131,7 +131,8 @@ def _check_sample(options: SampleOptions, domain: "Domain") -> None:
     if options.goal:
         domain.check_goal(options.goal)
     if options.animation and options.execute and domain.closed_loop:
-        require(domain.closed_loop.film, "animation", "a domain that films episodes", domain.name)
+        advice = f"{domain.name}; give its ClosedLoop a film, or draw --figure"
+        require(domain.closed_loop.film, "animation", "a domain that films episodes", advice)
     if options.export:
         known = " or ".join(domain.show.exports)
         expected = f"a name that ends in {known}" if known else f"none, as nothing else reads plans of {domain.name}"

@@ -227,13 +227,13 @@ class Privileged:
     Attributes:
         feature: shape of the quantity, a vector.
         error: error of a prediction by an image encoder: ``(prediction (sample, n), feature (sample, *shape)) -> (sample,)``.
-        told: simulated prediction with realistic errors, in place of an encoded image: ``(feature (sample, *shape), generator) ->
-            (sample, n)``; ``None`` for none.
+        simulate: simulation of a prediction with realistic errors, in place of an encoded image: ``(feature (sample, *shape),
+            generator) -> (sample, n)``; ``None`` for none.
     """
 
     feature: Feature
     error: Callable[[Tensor, Tensor], Tensor]
-    told: Callable[[Tensor, torch.Generator], Tensor] | None = None
+    simulate: Callable[[Tensor, torch.Generator], Tensor] | None = None
 
 
 @dataclass(frozen=True)

@@ -44,7 +44,6 @@ class Adaptation(pl.LightningModule, ABC):
     learns = False
     """Whether concepts are learned by gradient descent."""
     automatic_optimization = False
-    labels = Labels("", "", "")
 
     def __init__(self, pretrained: str, omega: float, output: str | None) -> None:
         super().__init__()
@@ -60,6 +59,11 @@ class Adaptation(pl.LightningModule, ABC):
         self._learned: dict[str, Concept] = {}
         self._of_user = False  # whether the demonstrations are a user's, not of a domain's tasks
 
+    @property
+    def labels(self) -> Labels:
+        """Labels of the rows in tables; by default the method's name alone."""
+        return Labels(self.model.method.name, "", "")
+
     @classmethod
     @abstractmethod
     def adapts(cls, model: type[ConceptModel]) -> bool:
@@ -68,7 +72,7 @@ class Adaptation(pl.LightningModule, ABC):
     @property
     def method(self) -> str:
         """The method's name in tables."""
-        return self.labels.method or self.model.method.name
+        return self.labels.method
 
     @property
     def form(self) -> str:

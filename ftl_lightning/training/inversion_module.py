@@ -25,7 +25,7 @@ from ftl_lightning.services.validation import flat, groups_of
 from ftl_lightning.training.adaptation import Adaptation, LearnerAdaptation
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.in_processes import learned_in_processes
-from ftl_lightning.training.labels import labels
+from ftl_lightning.training.labels import Labels, labels
 from ftl_lightning.training.method import Method
 
 _USUAL = InversionSettings()
@@ -69,7 +69,11 @@ class InversionModule(Adaptation):
         self.save_hyperparameters(flat(groups, INVERSION))
         self.settings = InversionSettings(components=components, omega=omega, seed=seed, form=form, **groups)
         self.model.check_settings(self.settings)
-        self.labels = labels(self.model.method, self.model.traits, self.settings, self.hparams)
+
+    @property
+    def labels(self) -> Labels:
+        """Labels of the settings, whose form is selected for a user's demonstrations."""
+        return labels(self.model.method, self.model.traits, self.settings, self.hparams)
 
     @classmethod
     def adapts(cls, model: type[ConceptModel]) -> bool:

@@ -42,7 +42,7 @@ class Teaching:
                 raise UserError(f"model.privileged: expected {names or 'none'} (domain {domain.name}), found {short(name)!r}")
             place, expected = f"model.privileged.{name}", f"image_encoder of {privileged.feature.shape[0]} points"
             require(images.size == privileged.feature.size, place, expected, f"{images.size} outputs")
-            possible = not self.share or privileged.told is not None
+            possible = not self.share or privileged.simulate is not None
             require(possible, "model.told", f"0, as the domain does not simulate encodings of {name!r}", self.share)
 
     def attach(self, images: ImageEncoders | None) -> None:
@@ -70,6 +70,6 @@ class Teaching:
     def simulated(self, domain: Domain, observed: Observed, draw: torch.Generator) -> dict[str, Tensor]:
         """Add simulated image encodings to the observations of windows without images."""
         (name,) = self.weights
-        simulate = domain.recordings.privileged[name].told
+        simulate = domain.recordings.privileged[name].simulate
         assert simulate is not None
         return {**observed, READ: simulate(observed[name], draw)}
