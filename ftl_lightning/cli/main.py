@@ -3,8 +3,10 @@
 import json
 import os
 import sys
+import warnings
 from argparse import ArgumentError
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,7 +15,7 @@ from omegaconf.errors import OmegaConfBaseException
 from ftl_lightning.cli import concepts, demonstrations, experiments, pages, sample
 from ftl_lightning.services import trust
 from ftl_lightning.services.command_line import TRAINER, Arguments, check_inputs, command_checks, one_line
-from ftl_lightning.services.errors import UserError, mistake_of_machine, require
+from ftl_lightning.services.errors import Note, UserError, mistake_of_machine, require
 from ftl_lightning.services.text import any_terminal, line, say
 from ftl_lightning.version import __version__
 
@@ -121,7 +123,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # Never unpickle, whatever a library's default is.
     os.environ["TORCH_FORCE_WEIGHTS_ONLY_LOAD"] = "1"
     try:
-        with trust.person(verb, read) as rest:
+        with trust.person(verb, read) as rest, _notes():
             _dispatch(verb, rest)
     except UserError as error:
         return _refused(str(error))
@@ -140,6 +142,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return _interrupted()
         return stop.code if isinstance(stop.code, int) else 0 if stop.code is None else 2
     return 0
+
+
+@contextmanager
+def _notes() -> Iterator[None]:
+    """Print notes about the input as lines, each once."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", Note)
+        shown, before = warnings.showwarning, set[str]()
+
+        def show(message: Warning | str, category: type[Warning], *place: Any, **options: Any) -> None:
+            if not issubclass(category, Note):
+                shown(message, category, *place, **options)
+            elif str(message) not in before:
+                before.add(str(message))
+                say("note:", line(str(message)), error=True)
+
+        warnings.showwarning = show
+        yield
 
 
 def _refused(message: str) -> int:

@@ -16,6 +16,8 @@ from ftl_lightning.services.text import Shown, counted
 
 KIND = "demonstrations"
 """Kind of a safetensors file of demonstrations."""
+CONTINUES = 1.5
+"""Maximum step of padding that continues a demonstration, relative to the largest valid step."""
 OBSERVED = "observed/"
 """Prefix of observed features in files."""
 
@@ -33,6 +35,7 @@ class Contents(TypedDict):
     per_step: tuple[str, ...]
     scenes: Tensor | None
     provenance: Mapping[str, Any]
+    state_kinds: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -55,7 +58,19 @@ FORMATS: dict[str, Format] = {}
 def read_contents(path: str | Path) -> Contents:
     """Read attributes of demonstrations from a ``path`` as in :meth:`Demonstrations.load`, without validating them."""
     kind, name = read_from(str(path))
-    return _format(kind, name).read(name)
+    contents = _format(kind, name).read(name)
+    states, lengths = contents["states"], contents["lengths"]
+    if states.dim() == 3 and lengths.shape == states.shape[:1] and bool(((lengths >= 1) & (lengths <= states.shape[1])).all()):
+        contents["states"] = held(states, lengths)
+        features = {name: held(contents["observed"][name], lengths) for name in contents["per_step"] if _timed(contents, name)}
+        contents["observed"] = {**contents["observed"], **features}
+    return contents
+
+
+def _timed(contents: Contents, name: str) -> bool:
+    """Whether a feature has a value at each time."""
+    values = contents["observed"].get(name)
+    return values is not None and values.dim() > 2 and values.shape[:2] == contents["states"].shape[:2]
 
 
 def _format(kind: str, name: str) -> Format:
@@ -68,10 +83,12 @@ class Demonstrations(Shown):
     """Demonstrations of tasks, in the domain's units.
 
     Attributes:
-        states: ``(demo, time, state)`` float32, padded beyond each demonstration's length.
+        states: ``(demo, time, state)`` float32, or float64 where float32 cannot hold the steps of a column.
+            Padded beyond each demonstration's length.
         lengths: ``(demo,)`` int64, between 1 and ``time``.
         domain: name of the domain; empty if unknown.
         state_names, state_units: an entry for each column of ``states``.
+        state_kinds: kind of each column, see :mod:`ftl_lightning.data.kinds`; empty if all are linear or unknown.
         concepts: a text for each demonstration; empty if unknown.
         observed: observed features by name. Features in ``per_step`` are ``(demo, time, *shape)``, conditions of a plan that starts
             at that time. Other features are ``(demo, *shape)``, known only at the first time. Vectors are float32, images uint8.
@@ -94,10 +111,11 @@ class Demonstrations(Shown):
     per_step: tuple[str, ...] = ()
     scenes: Tensor | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    state_kinds: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         size = tuple(self.states.shape)
-        typed = len(size) == 3 and self.states.dtype == torch.float32
+        typed = len(size) == 3 and self.states.dtype in (torch.float32, torch.float64)
         require(typed, "key 'states'", "float32 of shape (demo, time, state)", f"{self.states.dtype} {size}")
         require(min(size) > 0, "key 'states'", "at least one demonstration, time and column", f"none in {size}")
         count, time, state = size
@@ -107,6 +125,8 @@ class Demonstrations(Shown):
         require(within, "key 'lengths'", f"{count} values between 1 and {time}", lengths[:20])
         for key, texts, expected in (("state_names", self.state_names, state), ("state_units", self.state_units, state)):
             require(len(texts) == expected, f"key {key!r}", f"{expected} entries", len(texts))
+        kinds = len(self.state_kinds)
+        require(kinds in (0, state), "key 'state_kinds'", f"{state} entries", kinds)
         require(len(self.concepts) == count, "key 'concepts'", f"{count} entries", len(self.concepts))
         unknown = short(", ".join(sorted(set(self.per_step) - set(self.observed))))
         require(not unknown, "key 'per_step'", "names of observed features", unknown)
@@ -277,6 +297,32 @@ class Demonstrations(Shown):
                 message += " (observed at every time? then list it in per_step)"
             require(given is not None and given.fits(feature), f"key 'observed/{name}'", f"{feature.words} each", message)
         return self
+
+
+def paths_of(demonstrations: Demonstrations) -> list[Tensor]:
+    """States ``(time, state)`` of each demonstration, without padding."""
+    return [states[:length] for states, length in zip(demonstrations.states, demonstrations.lengths.tolist(), strict=True)]
+
+
+def held(values: Tensor, lengths: Tensor, continues: float = CONTINUES) -> Tensor:
+    """Values ``(demo, time, ...)`` with the last valid one in the padding, of demonstrations whose padding does not continue them.
+
+    Padding continues a demonstration if it is finite, and no step into it or in it is larger than ``continues`` times the
+    largest valid step of its column, as where vehicles drive on.
+    """
+    times = torch.arange(values.shape[1])
+    if not values.is_floating_point() or bool((lengths == len(times)).all()):
+        return values
+    flat = values.flatten(2)
+    steps, valid = flat.diff(dim=1).abs(), (times[1:] < lengths[:, None])[..., None]
+    largest = torch.where(valid, steps, 0).amax(dim=1, keepdim=True)
+    jumps = ((steps > continues * largest) | ~flat[:, 1:].isfinite()) & ~valid
+    rows = jumps.flatten(1).any(dim=1).nonzero()[:, 0]
+    if not len(rows):
+        return values
+    whole = values.clone()
+    whole[rows] = values[rows[:, None], torch.minimum(times, lengths[rows, None] - 1)]
+    return whole
 
 
 def concatenate(parts: Sequence[Demonstrations]) -> Demonstrations:

@@ -6,15 +6,16 @@ from typing import Self
 import torch
 from torch import Tensor, nn
 
-RELATIVE = 1e-6
-"""Minimum range of a column, as a share of its largest number; less counts as constant, the precision of float32."""
+RELATIVE = {torch.float32: 1e-6, torch.float64: 1e-13}
+"""Minimum range of a column, as a share of its largest number; less counts as constant, the precision of the type."""
 
 
 class Normalization(nn.Module):
     """Column-wise min-max to [-1, 1]. A constant column maps to 0 and back to its value.
 
     Args:
-        low, high: ``(state,)``, extremes of pretraining data. Columns with ``high <= low`` are constant.
+        low, high: ``(state,)`` float32, or float64 for such data; extremes of pretraining data. A column with ``high <= low`` is
+            constant.
     """
 
     low: Tensor
@@ -22,8 +23,8 @@ class Normalization(nn.Module):
 
     def __init__(self, low: Tensor, high: Tensor) -> None:
         super().__init__()
-        self.register_buffer("low", low.float().clone())
-        self.register_buffer("high", high.float().clone())
+        self.register_buffer("low", low.clone())
+        self.register_buffer("high", high.clone())
 
     @classmethod
     def fit(cls, states: Tensor, shared: Sequence[Sequence[int]] = (), resolution: float = 0.0, plane: Sequence[int] = ()) -> Self:
@@ -46,7 +47,7 @@ class Normalization(nn.Module):
             columns = torch.tensor(list(plane))
             high[columns] = torch.maximum(high[columns], -low[columns]).amax()
             low[columns] = -high[columns]
-        rounding = RELATIVE * torch.maximum(low.abs(), high.abs())
+        rounding = RELATIVE[flat.dtype] * torch.maximum(low.abs(), high.abs())
         return cls(low, torch.where(high - low < torch.clamp(rounding, min=resolution), low, high))
 
     def share(self, columns: Sequence[int], other: Self) -> None:
@@ -58,10 +59,10 @@ class Normalization(nn.Module):
         return ((self.high - self.low) / 2).clamp(min=0)
 
     def encode(self, states: Tensor) -> Tensor:
-        """Normalise ``(..., state)`` from the domain's units; values outside the extremes go beyond [-1, 1]."""
+        """Normalise ``(..., state)`` to float32 from the domain's units; values outside the extremes go beyond [-1, 1]."""
         half = self._half_width
         varies = half > 0
-        return torch.where(varies, (states - self.low) / torch.where(varies, half, 1) - 1, 0)
+        return torch.where(varies, (states - self.low) / torch.where(varies, half, 1) - 1, 0).float()
 
     def decode(self, normalised: Tensor) -> Tensor:
         """Invert :meth:`encode`."""

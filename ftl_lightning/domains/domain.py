@@ -6,13 +6,14 @@ Name, plans, concepts and source are required; every other field has a default.
 import difflib
 import importlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
+from ftl_lightning.data.columns import aligned
 from ftl_lightning.data.demonstrations import Demonstrations, padded
 from ftl_lightning.data.distances import Distance
 from ftl_lightning.data.features import Feature, InitialStates, Observed
@@ -26,6 +27,8 @@ from ftl_lightning.services.randomness import VALIDATION_SEED
 from ftl_lightning.services.text import Shown, counted
 
 ACCURACY, SUCCESS, CLOSED = "accuracy", "success", "closed loop"
+OWN = "own"
+"""Name of the domain of user data."""
 NOVELTY, COVERAGE = "novelty", "coverage"
 """Distances that are measured in every domain, unless it has a metric of this name, see
 :mod:`ftl_lightning.evaluation.references`."""
@@ -53,6 +56,7 @@ class View:
         same_columns: whether encoded states have the same columns as the domain's states.
         plane: columns of an encoded state that are x and y in the coordinates of observed points; a denoiser may rotate plans and
             points together.
+        columns: names of the columns of an encoded state; empty if there are as many as of a state, without names.
     """
 
     features: Mapping[str, Feature]
@@ -64,6 +68,7 @@ class View:
     scales: tuple[tuple[int, ...], ...] = ()
     same_columns: bool = False
     plane: tuple[int, ...] = ()
+    columns: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -82,6 +87,7 @@ class Plans:
         resolution: smallest variation of a column of states or observed vectors, in its unit; columns that vary by less count as
             constant.
         views: alternative representations of behaviour for models, by name. A model without a view sees states as they are.
+        kinds: resolved kind of each column of a user's data, see :mod:`ftl_lightning.data.kinds`; empty if all are linear.
     """
 
     horizon: int
@@ -92,6 +98,7 @@ class Plans:
     at_rest: bool = True
     groups: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
     views: Mapping[str, View] = field(default_factory=dict)
+    kinds: tuple[str, ...] = ()
 
     def grouped(self, names: Sequence[str]) -> tuple[int, ...]:
         """Columns of groups; raises a ``UserError`` for an unknown name."""
@@ -298,6 +305,20 @@ class Domain(Shown):
             yield f"judged by {', '.join(self.metrics)}"
         if self.closed_loop is not None:
             yield f"executed for up to {counted(self.closed_loop.steps, 'step')}"
+
+    def fitted(self, demonstrations: Demonstrations, place: str = "states") -> Demonstrations:
+        """Demonstrations in the order and units of the domain's columns, see :func:`~ftl_lightning.data.columns.aligned`.
+
+        Raises:
+            UserError: naming the ``place`` or key, for behaviour of another domain, other columns or units, or a missing feature.
+        """
+        known = (self.name, "") if self.name != OWN else (self.name, "", demonstrations.domain)  # a user's data may name any
+        wanted = f"behaviour of {self.name}, the model's domain"
+        require(demonstrations.domain in known, place, wanted, f"that of {short(demonstrations.domain)}")
+        expected, columns = len(self.plans.columns), demonstrations.states.shape[2]
+        require(columns == expected, place, f"states of {expected} columns ({self.name})", columns)
+        fitted = aligned(demonstrations, self.plans.columns, self.plans.units).fitted(self.observed)
+        return replace(fitted, state_kinds=self.plans.kinds)
 
     def measure(self, goal: str, states: Tensor, starts: InitialStates | None) -> dict[str, Tensor]:
         """Values of all metrics for plans ``(sample, horizon, state)``, by name.

@@ -23,25 +23,27 @@ Plans are compared with held-out demonstrations; for a new concept, with the dem
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from ftl_lightning.data.demonstrations import Demonstrations
+from ftl_lightning.data.columns import check_precision
+from ftl_lightning.data.demonstrations import Demonstrations, held, paths_of
 from ftl_lightning.data.distances import warped_distances
 from ftl_lightning.data.features import InitialStates
+from ftl_lightning.data.kinds import Columns, declared, resolved
 from ftl_lightning.domains.comparison import Comparison
-from ftl_lightning.domains.domain import Concepts, Domain, Metric, Plans, Recordings, Split
+from ftl_lightning.domains.domain import OWN, Concepts, Domain, Metric, Plans, Recordings, Split, View
 from ftl_lightning.domains.recognition import Recognition
 from ftl_lightning.domains.recorder import drawn_by_hand
-from ftl_lightning.services.errors import about, require, short
+from ftl_lightning.services.errors import about, note, require
 from ftl_lightning.services.randomness import generator
 
-OWN = "own"
-"""Name of the domain of user data."""
+CONTINUOUS = "continuous"
+"""View of data with columns that are not linear."""
 
 
 @dataclass(frozen=True)
@@ -85,19 +87,59 @@ def own_domain(
     unknown = sorted(set(metrics) - set(METRICS))
     require(not unknown, "data.metrics", f"some of {', '.join(METRICS)}", ", ".join(unknown))
     source = source or FileSource(examples, torch.ones(len(examples), dtype=torch.bool))
+    columns = Columns(examples.state_kinds)
+    names, judged, convert = columns.names(examples.state_names), examples, _same
+    if columns or examples.states.dtype == torch.float64:
+        convert = partial(_continuous, columns, columns.encode(examples.states).flatten(0, 1).mean(dim=0))
+        units = ("",) * len(names)
+        judged = replace(examples, states=convert(examples.states), state_names=names, state_units=units, state_kinds=())
+    view = View(
+        examples.features,
+        observe=lambda observed: observed,
+        encode=lambda states, observed: columns.encode(states),
+        decode=lambda states, observed: columns.decode(states),
+        columns=names,
+    )
+
+    def metric(name: str, number: float) -> Metric:
+        made = METRICS[name](judged, horizon, number)
+        return replace(
+            made, measure=lambda goal, states, starts: made.measure(goal, convert(states), starts), identity=examples.hash
+        )
+
+    def distance(states: Tensor, others: Tensor) -> Tensor:
+        return _distance(judged, convert(states), convert(others))
+
     return Domain(
         name=OWN,
-        plans=Plans(horizon, examples.state_names, examples.state_units),
+        plans=Plans(
+            horizon,
+            examples.state_names,
+            examples.state_units,
+            views={CONTINUOUS: view} if columns else {},
+            kinds=examples.state_kinds,
+        ),
         concepts=Concepts(training=tuple(training), reads=frozenset(examples.concepts).__contains__),
         source=lambda root: source,
         observed=examples.features,
-        metrics={name: METRICS[name](examples, horizon, number) for name, number in metrics.items()},
-        comparison=Comparison(headline=next(iter(metrics), ""), distance=partial(_distance, examples), fresh=False),
+        metrics={name: metric(name, number) for name, number in metrics.items()},
+        comparison=Comparison(headline=next(iter(metrics), ""), distance=distance, fresh=False),
         recordings=Recordings(recorder=drawn_by_hand(examples, horizon)),
     )
 
 
-def domain_from_file(path: str, horizon: int | None, metrics: Mapping[str, float], share: float) -> Domain:
+def _same(states: Tensor) -> Tensor:
+    return states
+
+
+def _continuous(columns: Columns, centre: Tensor, states: Tensor) -> Tensor:
+    """Continuous columns of states ``(..., state)`` in float32, less a ``centre`` so that nothing is lost."""
+    return (columns.encode(states) - centre).float()
+
+
+def domain_from_file(
+    path: str, horizon: int | None, metrics: Mapping[str, float], share: float, kinds: Mapping[str, str] | None = None
+) -> Domain:
     """Domain of a file.
 
     Args:
@@ -105,11 +147,14 @@ def domain_from_file(path: str, horizon: int | None, metrics: Mapping[str, float
         horizon: states in a plan; ``None`` for the length of the longest demonstration.
         metrics: see :func:`own_domain`.
         share: share of each concept's demonstrations to hold out, at least a single demonstration.
+        kinds: kinds of columns by name, see :func:`~ftl_lightning.data.kinds.declared`.
 
     Raises:
         UserError: naming the file, if it has no texts, fewer than two concepts, or a concept with a single demonstration.
     """
-    demonstrations = read_own(path)
+    demonstrations = of_kinds(read_own(path), kinds or {}, path)
+    with about(path):
+        check_precision(demonstrations)
     training = tuple(dict.fromkeys(demonstrations.concepts))
     expected = "texts of two concepts or more to pretrain on"
     require(len(training) >= 2, f"{path}: key 'concepts'", expected, len(training))
@@ -129,7 +174,22 @@ def read_own(path: str) -> Demonstrations:
     Raises:
         UserError: naming the file, if it is missing or damaged.
     """
-    return Demonstrations.load(path).named(Path(path).stem)
+    read = Demonstrations.load(path).named(Path(path).stem)
+    return replace(read, states=held(read.states, read.lengths, continues=0))
+
+
+def of_kinds(demonstrations: Demonstrations, kinds: Mapping[str, str], place: str) -> Demonstrations:
+    """Demonstrations with the resolved kind of each column, declared or proposed by the data; a note names what is not linear.
+
+    Raises:
+        UserError: for an unknown column or kind, or values that contradict a declared kind.
+    """
+    names, units = demonstrations.state_names, demonstrations.state_units
+    given = declared(names, demonstrations.state_kinds, kinds, f"{place}: data.kinds")
+    found = resolved(paths_of(demonstrations), names, units, given, place)
+    for text in Columns(found).notes(names):
+        note(f"{place}: {text}; data.kinds declares others")
+    return replace(demonstrations, state_kinds=found)
 
 
 def read_demonstrations(path: str, domain: Domain) -> Demonstrations:
@@ -138,13 +198,9 @@ def read_demonstrations(path: str, domain: Domain) -> Demonstrations:
     Raises:
         UserError: naming the file, if it does not fit the domain.
     """
-    demonstrations = read_own(path)
-    columns, shape = len(domain.plans.columns), tuple(demonstrations.states.shape)
-    fits = demonstrations.domain in ("", domain.name)
-    require(fits, f"{path}: key 'domain'", repr(domain.name), repr(short(demonstrations.domain)))
-    require(shape[2] == columns, f"{path}: key 'states'", f"shape (demo, time, {columns})", str(shape))
+    demonstrations = Demonstrations.load(path).named(Path(path).stem)
     with about(path):
-        return demonstrations.fitted(domain.observed)
+        return domain.fitted(demonstrations, "key 'states'")
 
 
 def _rows(demonstrations: Demonstrations, concept: str) -> list[int]:

@@ -9,10 +9,10 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from ftl_lightning.data.check import Finding, mended
+from ftl_lightning.data.columns import precise
 from ftl_lightning.data.demonstrations import Demonstrations, padded
 from ftl_lightning.data.features import Feature, InitialStates
-from ftl_lightning.domains.domain import Domain
-from ftl_lightning.domains.from_file import OWN
+from ftl_lightning.domains.domain import OWN, Domain
 from ftl_lightning.services.errors import UserError, short, shown
 
 Start = InitialStates | Mapping[str, ArrayLike] | ArrayLike
@@ -33,8 +33,7 @@ def demonstrations_of(
             only at the first; for different lengths, a list as for the states.
     """
     if isinstance(states, Demonstrations):
-        check_of_domain("states", states, domain)
-        return states.named(name).fitted(domain.observed)
+        return domain.fitted(states.named(name))
     whole, lengths = _padded("states", states)
     columns = len(domain.plans.columns)
     if whole.dim() != 3 or whole.shape[2] != columns:
@@ -49,16 +48,18 @@ def demonstrations_of(
         if part.dim() == len(feature.shape) + 2:
             per_step.append(key)
         features[key] = part.float() if feature.kind == "vector" else part
-    return Demonstrations(
-        states=whole.float(),
-        lengths=lengths,
-        domain=domain.name,
-        state_names=domain.plans.columns,
-        state_units=domain.plans.units,
-        concepts=(name,) * len(whole),
-        observed=features,
-        per_step=tuple(per_step),
-    ).fitted(domain.observed)
+    return domain.fitted(
+        Demonstrations(
+            states=torch.from_numpy(precise(whole.numpy())),
+            lengths=lengths,
+            domain=domain.name,
+            state_names=domain.plans.columns,
+            state_units=domain.plans.units,
+            concepts=(name,) * len(whole),
+            observed=features,
+            per_step=tuple(per_step),
+        )
+    )
 
 
 def of_one_concept(own: Demonstrations) -> Demonstrations:
@@ -126,7 +127,7 @@ def _starts(domain: Domain, given: Any) -> InitialStates:
 
 def scenes_of(given: ArrayLike) -> Tensor:
     """Convert scenes of initial states to ``(episode, scene)``; ``UserError`` for anything else."""
-    scenes = tensor_of("scenes", given)
+    scenes = tensor_of("scenes", given).float()
     if scenes.dim() != 2 or not len(scenes) or not scenes.isfinite().all():
         raise UserError(
             "scenes: expected where episodes start, what model.starts(goal, count) draws or finite numbers (episode, scene), "
@@ -136,12 +137,15 @@ def scenes_of(given: ArrayLike) -> Tensor:
 
 
 def tensor_of(key: str, values: Any) -> Tensor:
-    """Convert numbers to a tensor on the CPU: uint8 is kept, everything else becomes float32.
+    """Convert numbers to a tensor on the CPU: uint8 and float64 are kept, whole numbers become float64, all else float32.
 
     Raises:
-        UserError: naming the argument, for anything but numbers, or rows of different lengths.
+        UserError: naming the argument, for anything but numbers, masked values, or rows of different lengths.
     """
     tensor = values
+    if isinstance(values, np.ma.MaskedArray) and np.ma.is_masked(values):
+        where = tuple(int(part[0]) for part in np.ma.getmaskarray(values).nonzero())
+        raise UserError(f"{key}: expected every value, found a masked one at index {where}; fill it or leave its time out")
     if not isinstance(values, Tensor):
         try:
             array = np.asarray(values, order="C")
@@ -151,7 +155,9 @@ def tensor_of(key: str, values: Any) -> Tensor:
     if tensor is None or tensor.is_complex():
         raise UserError(f"{key}: expected an array of numbers, found {shown(values)}")
     tensor = tensor.detach().cpu()
-    return tensor if tensor.dtype == torch.uint8 else tensor.float()
+    if tensor.dtype in (torch.uint8, torch.float64):
+        return tensor
+    return tensor.float() if tensor.is_floating_point() or tensor.dtype == torch.bool else tensor.double()
 
 
 def _padded(key: str, values: Any) -> tuple[Tensor, Tensor]:

@@ -333,10 +333,9 @@ class FewShot(Shown):
         """
         if not isinstance(demonstrations, Demonstrations):
             raise UserError(f"learn_all: expected Demonstrations, such as of Demonstrations.load, found {shown(demonstrations)}")
-        check_of_domain("demonstrations", demonstrations, self.domain)
         if not demonstrations.concepts or not all(demonstrations.concepts):
             raise UserError("demonstrations: expected a text for each, which names its concept, found none; use learn, with name")
-        fitted = demonstrations.fitted(self.domain.observed)
+        fitted = self.domain.fitted(demonstrations, "demonstrations")
         learned = self._learn(fitted, "learn_all", steps, seed, progress, None, changes)
         return {concept.concept.origin.name: concept for concept in learned}
 

@@ -9,8 +9,7 @@ import numpy as np
 import pandas as pd
 
 from ftl_lightning.domains.comparison import OURS, PAPERS_METHOD, Compared, Comparison, Published
-from ftl_lightning.domains.domain import CLOSED, COVERAGE, EXECUTED, NOVELTY, Concepts, Domain, Metric, Plans
-from ftl_lightning.domains.from_file import OWN
+from ftl_lightning.domains.domain import CLOSED, COVERAGE, EXECUTED, NOVELTY, OWN, Concepts, Domain, Metric, Plans
 from ftl_lightning.domains.registry import domain_of_file, is_known
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.evaluation.generation import LOST, WON, standard_error

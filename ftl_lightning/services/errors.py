@@ -1,5 +1,6 @@
 """Errors that a user can cause and correct."""
 
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,6 +14,15 @@ class UserError(Exception):
 
     The command line prints it without a traceback and exits with code 2.
     """
+
+
+class Note(UserWarning):
+    """Assumption about the input, or a change to it. The command line prints it as ``note: ...``."""
+
+
+def note(message: str) -> None:
+    """Warn of an assumption about the input, or of a change to it."""
+    warnings.warn(message, Note, stacklevel=3)
 
 
 def short(text: str, most: int = 60) -> str:

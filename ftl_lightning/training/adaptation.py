@@ -10,7 +10,7 @@ import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 
 from ftl_lightning.data.demonstrations import Demonstrations
-from ftl_lightning.domains.from_file import OWN
+from ftl_lightning.domains.domain import OWN
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.domains.tasks import WITHOUT_WEIGHT, EvaluationTask
 from ftl_lightning.igm.composition import Composition
@@ -109,11 +109,8 @@ class Adaptation(pl.LightningModule, ABC):
         self.concepts = data.concepts
         self._files = concept_files(self.concepts, self.folder, "concepts")
         self._learned = {}
-        expected, columns = len(self.domain.plans.columns), data.demonstrations.states.shape[2]
-        if columns != expected:
-            raise UserError(f"data.demonstrations: expected states of {expected} columns (the pretrained model's), found {columns}")
         try:
-            self.demonstrations: Demonstrations = data.demonstrations.fitted(self.domain.observed)
+            self.demonstrations: Demonstrations = self.domain.fitted(data.demonstrations)
         except UserError as error:
             raise UserError(f"data.demonstrations: {error}") from None
         self._of_user = data.of_user

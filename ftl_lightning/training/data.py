@@ -16,8 +16,8 @@ from torch.utils.data import DataLoader, IterableDataset
 
 from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.data.features import check_features
-from ftl_lightning.domains.domain import Domain, Recoveries
-from ftl_lightning.domains.from_file import OWN, domain_from_file, read_demonstrations, read_own
+from ftl_lightning.domains.domain import OWN, Domain, Recoveries
+from ftl_lightning.domains.from_file import domain_from_file, read_demonstrations, read_own
 from ftl_lightning.domains.registry import load_domain, recorded_name
 from ftl_lightning.networks.text_encoder import Encoder, load_encoder
 from ftl_lightning.services.errors import UserError, require, short
@@ -168,6 +168,11 @@ class PretrainingData(pl.LightningDataModule):
         return demonstrations
 
     @property
+    def view(self) -> str:
+        """View that the data need; empty for none."""
+        return ""
+
+    @property
     def examples(self) -> Demonstrations | None:
         """Demonstrations saved with a model of user data, else ``None``."""
         return None
@@ -236,6 +241,8 @@ class OwnData(PretrainingData):
             :meth:`ftl_lightning.data.demonstrations.Demonstrations.load`; or the folder of a LeRobot data set, or the name of
             an installed Minari data set.
         metrics: metrics of plans, number by name, see :mod:`ftl_lightning.domains.from_file`; empty for none.
+        kinds: kinds of columns by name, such as ``{heading: angle}``, see :mod:`ftl_lightning.data.kinds`; other columns have the
+            kind that the file declares or the data show.
         validation_share: share of each concept's demonstrations to hold out, at least a single demonstration.
         seed, batch_size, steps_per_epoch, encoder, revision: see :class:`PretrainingData`; the default encoder is ``'minilm'``
             where it is installed, else ``'hashing'``.
@@ -249,6 +256,7 @@ class OwnData(PretrainingData):
         self,
         demonstrations: str,
         metrics: dict[str, float] | None = None,
+        kinds: dict[str, str] | None = None,
         validation_share: float = 0.1,
         seed: int = 0,
         batch_size: int = 128,
@@ -260,6 +268,7 @@ class OwnData(PretrainingData):
     ) -> None:
         require(0 < validation_share < 1, "data.validation_share", "a share between 0 and 1", validation_share)
         self._file, self._share, self._metrics, self._horizon = demonstrations, validation_share, dict(metrics or {}), horizon
+        self._kinds = dict(kinds or {})
         super().__init__(
             domain=OWN,
             seed=seed,
@@ -274,7 +283,12 @@ class OwnData(PretrainingData):
         self.metrics = self._metrics
 
     def _domain(self, name: str) -> tuple[str, Domain]:
-        return OWN, domain_from_file(self._file, self._horizon, self._metrics, self._share)
+        return OWN, domain_from_file(self._file, self._horizon, self._metrics, self._share, self._kinds)
+
+    @property
+    def view(self) -> str:
+        """The continuous view, if a column is not linear."""
+        return next(iter(self.domain.plans.views), "")
 
     @property
     def examples(self) -> Demonstrations:

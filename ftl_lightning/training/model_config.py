@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.data.normalization import Normalization
-from ftl_lightning.domains.domain import Domain, View
-from ftl_lightning.domains.from_file import OWN
+from ftl_lightning.domains.domain import OWN, Domain, View
 from ftl_lightning.networks.conditions import Sizes
 from ftl_lightning.services.errors import UserError, about, short, shown
 from ftl_lightning.services.shipped import missing_model
@@ -69,6 +68,11 @@ def find_view(domain: Domain, name: str) -> View | None:
     return domain.plans.views[name]
 
 
+def width_of(domain: Domain, view: View | None) -> int:
+    """Number of columns that a model generates."""
+    return len(view.columns if view is not None and view.columns else domain.plans.columns)
+
+
 def read_config(folder: str | Path) -> dict[str, Any]:
     """Read the configuration of a pretrained model, with its ``format``, ``hash`` and ``kind``, as plain data.
 
@@ -89,11 +93,11 @@ def read_config(folder: str | Path) -> dict[str, Any]:
 
 def check_domain(config: ModelConfig, domain: Domain) -> None:
     """Refuse sizes that differ from the domain's; ``UserError`` with the key."""
-    if config.state_dim != (columns := len(domain.plans.columns)):
-        raise UserError(f"key 'state_dim': expected {columns} (domain {domain.name}), found {config.state_dim}")
     if config.metrics and config.domain != OWN:
         raise UserError(f"key 'metrics': expected none, as domain {domain.name} has its own, found {shown(dict(config.metrics))}")
     view = find_view(domain, config.view)
+    if config.state_dim != (columns := width_of(domain, view)):
+        raise UserError(f"key 'state_dim': expected {columns} (domain {domain.name}), found {config.state_dim}")
     expected = domain.observed if view is None else view.features
     for name, feature in config.observed.items():
         if name not in expected or not feature.fits(expected[name]):

@@ -12,8 +12,8 @@ from torch import Tensor, nn
 from torch.nn.modules.module import register_module_parameter_registration_hook
 
 from ftl_lightning.data.demonstrations import Demonstrations
-from ftl_lightning.domains.domain import Domain
-from ftl_lightning.domains.from_file import OWN, own_domain
+from ftl_lightning.domains.domain import OWN, Domain
+from ftl_lightning.domains.from_file import own_domain
 from ftl_lightning.domains.registry import domain_of_file, is_known, load_domain
 from ftl_lightning.services.errors import UserError, about, short
 from ftl_lightning.services.shipped import pretrained_folder
@@ -85,6 +85,8 @@ def read_model(kind: type[M], folder: str | Path, domain: Domain | None = None) 
         check_weights(tensors, expected)
     model = kind(blank(config, domain))
     model.examples = examples
+    if tensors["normalization.low"].dtype == torch.float64:
+        model.normalization.double()
     model.load_state_dict(tensors)
     return model.requires_grad_(False).eval()
 

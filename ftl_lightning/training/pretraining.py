@@ -29,7 +29,7 @@ from ftl_lightning.services.validation import LARGEST_FACTOR, LARGEST_RATE, chec
 from ftl_lightning.training.checkpoint import SIGNATURE, Random, check_parameters, check_restored, check_signature
 from ftl_lightning.training.concept_model import ConceptModel, joined_vectors
 from ftl_lightning.training.data import Batch, PretrainingData
-from ftl_lightning.training.model_config import ModelConfig, Prepared, find_view
+from ftl_lightning.training.model_config import ModelConfig, Prepared, find_view, width_of
 from ftl_lightning.training.model_folder import save_model
 from ftl_lightning.training.teaching import Teaching
 
@@ -151,7 +151,8 @@ class Pretraining(pl.LightningModule, ABC, Generic[M]):
         concepts = data.domain.concepts.training
         embeddings = data.encoder((EMPTY, *concepts))
         check_different(concepts, embeddings[1:])
-        view = find_view(data.domain, self.hparams["view"])
+        name = self.hparams["view"] or data.view
+        view = find_view(data.domain, name)
         features = data.domain.observed if view is None else view.features
         observed: Observed
         if view is None:
@@ -165,12 +166,12 @@ class Pretraining(pl.LightningModule, ABC, Generic[M]):
         config = ModelConfig(
             domain=data.domain_name,
             horizon=data.horizon,
-            state_dim=len(data.domain.plans.columns),
+            state_dim=width_of(data.domain, view),
             observed=dict(features),
             concept_dim=embeddings.shape[-1],
             training_concepts=concepts,
             encoder=data.encoder.identity,
-            view=self.hparams["view"],
+            view=name,
             perturb=self.hparams["perturb"],
             image_dim=image_dim,
             image_encoder=self.image_encoder,

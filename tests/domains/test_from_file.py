@@ -336,7 +336,7 @@ def test_new_demonstrations_that_do_not_fit_are_refused(fitted: Path, tmp_path: 
     np.savez("calm.npz", states=walks("go between", 2), concepts="calm")
     wind = r"data.demonstrations: key 'observed/wind': expected float32 of shape \(2,\) each, found none"
     for pretrained, name, expected in (
-        (str(fitted), "wide.npz", r"expected states of 2 columns \(the pretrained model's\), found 3"),
+        (str(fitted), "wide.npz", r"expected states of 2 columns \(own\), found 3"),
         ("model", "calm.npz", wind),
     ):
         with pytest.raises(UserError, match=expected):

@@ -14,7 +14,8 @@ from ftl_lightning.apps.benchmark.strokes import strokes
 from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.data.features import Feature
 from ftl_lightning.data.normalization import Normalization
-from ftl_lightning.domains.from_file import OWN, own_domain
+from ftl_lightning.domains.domain import OWN
+from ftl_lightning.domains.from_file import own_domain
 from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.few_shot.tuned import ModelSettings
 from ftl_lightning.igm.composition import Composition, batched

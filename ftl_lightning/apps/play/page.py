@@ -15,8 +15,8 @@ from ftl_lightning.apps.play.mixing import Json, plan_film, sampling_of, starts_
 from ftl_lightning.apps.play.workspace import Workspace
 from ftl_lightning.data.check import check, read_mended
 from ftl_lightning.data.demonstrations import Demonstrations
-from ftl_lightning.domains.domain import Domain
-from ftl_lightning.domains.from_file import OWN, read_own
+from ftl_lightning.domains.domain import OWN, Domain
+from ftl_lightning.domains.from_file import read_own
 from ftl_lightning.domains.pictures import Show, line_drawings
 from ftl_lightning.domains.registry import domain_names, load_domain
 from ftl_lightning.few_shot.learner import FewShot

@@ -44,6 +44,7 @@ class Metadata:
         per_step: names of the features that are known at every time; ``None`` for all. Other features are constant in an episode,
             and known only at its start.
         provenance: origin of the demonstrations.
+        state_kinds: kind of each column; empty if all are linear.
     """
 
     domain: str = ""
@@ -51,11 +52,12 @@ class Metadata:
     state_units: tuple[str, ...] | None = None
     per_step: tuple[str, ...] | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    state_kinds: tuple[str, ...] = ()
 
 
 def metadata(demonstrations: Demonstrations) -> dict[str, Any]:
     """Attributes of :class:`Metadata` as JSON can hold them."""
-    names = ("domain", "state_names", "state_units", "per_step", "provenance")
+    names = ("domain", "state_names", "state_units", "per_step", "provenance", "state_kinds")
     return asdict(Metadata(**{name: getattr(demonstrations, name) for name in names}))
 
 
@@ -108,6 +110,7 @@ def from_episodes(episodes: Sequence[Episode], given: Metadata) -> Contents:
         "per_step": per_step,
         "scenes": torch.stack(scenes) if len(scenes) == len(episodes) else None,
         "provenance": given.provenance,
+        "state_kinds": given.state_kinds,
     }
 
 

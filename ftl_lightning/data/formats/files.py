@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ftl_lightning.data.columns import precise
 from ftl_lightning.data.demonstrations import FORMATS, KIND, OBSERVED, Contents, Demonstrations, Format
 from ftl_lightning.services.errors import UserError, about, require, short
 from ftl_lightning.services.files import MOST_TENSORS, check_readable, check_unpacked
@@ -25,7 +26,7 @@ from ftl_lightning.services.validation import check_type
 VERSION = 4
 """Version of the safetensors format. Images are compressed (zlib) to 1-D uint8; the header has their shapes by key as
 ``compressed``."""
-TEXTS = ("state_names", "state_units", "concepts", "per_step")
+TEXTS = ("state_names", "state_units", "state_kinds", "concepts", "per_step")
 """Keys of lists of texts."""
 MOST_SHRUNK = 1032
 """Maximum compression ratio of zlib."""
@@ -105,6 +106,8 @@ def read_npz(name: str) -> Contents:
 
 def _tensor(key: str, array: NDArray[Any]) -> Tensor:
     """Convert an array: images stay uint8 and whole lengths int64; other numbers become float32."""
+    if key == "states":
+        return torch.from_numpy(np.array(precise(array), order="C", ndmin=array.ndim))
     image = array.dtype == np.uint8 and key.startswith(OBSERVED)
     kind = np.uint8 if image else np.int64 if key == "lengths" and array.dtype.kind in "iu" else np.float32
     with np.errstate(over="ignore"):  # overflow is reported later as a number that is not finite
@@ -112,7 +115,8 @@ def _tensor(key: str, array: NDArray[Any]) -> Tensor:
 
 
 def _header(demonstrations: Demonstrations) -> dict[str, Any]:
-    return {"domain": demonstrations.domain, **{key: getattr(demonstrations, key) for key in TEXTS}}
+    texts = {key: getattr(demonstrations, key) for key in TEXTS}
+    return {"domain": demonstrations.domain, **{key: value for key, value in texts.items() if key != "state_kinds" or value}}
 
 
 def _contents(tensors: dict[str, Tensor], header: Mapping[str, Any]) -> Contents:
@@ -138,6 +142,7 @@ def _contents(tensors: dict[str, Tensor], header: Mapping[str, Any]) -> Contents
         "per_step": per_step,
         "scenes": tensors.get("scenes"),
         "provenance": check_type(header.get("provenance", {}), Mapping[str, Any], "provenance"),
+        "state_kinds": texts.get("state_kinds", ()),
     }
 
 

@@ -1,0 +1,130 @@
+"""Columns of states: precision, names and units."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ftl_lightning.data.demonstrations import Demonstrations, paths_of
+from ftl_lightning.services.errors import UserError, note, require, short
+
+COARSE = 1e-4
+"""Maximum spacing of float32 at a column's largest number, as a share of the column's range; more needs float64."""
+LOST = 1e-2
+"""The same for float32 files, whose steps are lost beyond; for columns that move smoothly."""
+SMOOTH = 0.8
+"""Minimum correlation of neighbouring values of a column that moves rather than being noise."""
+LEAST_STEP = 4 * 2.0**-24
+"""Minimum median step of a column, as a share of its range, that float32 can hold after scaling."""
+UNITS = {
+    **{"m": ("length", 1.0), "cm": ("length", 0.01), "mm": ("length", 0.001), "km": ("length", 1000.0)},
+    **{"ft": ("length", 0.3048), "in": ("length", 0.0254), "rad": ("angle", 1.0), "deg": ("angle", math.pi / 180)},
+    **{"s": ("time", 1.0), "ms": ("time", 0.001), "min": ("time", 60.0)},
+}
+"""Quantity and factor of units that are converted."""
+
+
+def precise(values: NDArray[Any]) -> NDArray[np.float32] | NDArray[np.float64]:
+    """Convert states ``(..., column)`` to float32, or to float64 if float32 cannot hold how a column varies."""
+    with np.errstate(over="ignore", invalid="ignore"):  # overflow is reported later as a number that is not finite
+        single = np.asarray(values, dtype=np.float32)
+        if values.dtype.itemsize <= 4 or values.dtype.kind not in "fiu" or not values.size or values.ndim < 2:
+            return single
+        flat = np.asarray(values, dtype=np.float64).reshape(-1, values.shape[-1])
+        finite = np.isfinite(flat)
+        low, high = np.where(finite, flat, np.inf).min(axis=0), np.where(finite, flat, -np.inf).max(axis=0)
+        spacing = np.spacing(np.maximum(np.abs(low), np.abs(high)).astype(np.float32)).astype(np.float64)
+        coarse = (spacing > COARSE * (high - low)) & (high - low > 1e-12 * np.maximum(np.abs(low), np.abs(high)))
+    return np.asarray(values, dtype=np.float64) if coarse.any() else single
+
+
+def check_precision(demonstrations: Demonstrations) -> None:
+    """Refuse columns whose steps float32 cannot hold, after reading or after scaling.
+
+    Raises:
+        UserError: naming the column.
+    """
+    paths = [path.double() for path in paths_of(demonstrations)]
+    every = torch.cat(paths)
+    low, high = every.amin(dim=0), every.amax(dim=0)
+    for column, name in enumerate(demonstrations.state_names):
+        size, width = max(abs(float(low[column])), abs(float(high[column]))), float(high[column] - low[column])
+        steps = torch.cat([path[:, column].diff().abs() for path in paths])
+        moving, place = steps[steps > 0], f"key 'states': column {short(name, 40)!r}"
+        if not len(moving) or not width:
+            continue
+        if demonstrations.states.dtype == torch.float32:
+            spacing = float(np.spacing(np.float32(size)))
+            if LOST * width < spacing < width / 4 and _smooth([path[:, column] for path in paths]):
+                found = f"steps of {spacing:.2g} near {size:.3g}; subtract an offset, or store float64"
+                raise UserError(f"{place}: expected numbers that float32 can hold, found {found}")
+        elif float(moving.median()) < LEAST_STEP * width:
+            found = (
+                f"a median step of {float(moving.median()):.2g} in a range of {width:.3g}; leave the column out, or cut the range"
+            )
+            raise UserError(f"{place}: expected steps that float32 can hold, found {found}")
+
+
+def _smooth(columns: Sequence[torch.Tensor]) -> bool:
+    """Whether a column ``(time,)`` moves smoothly in its demonstrations: neighbouring values are correlated."""
+    centred = [column - column.mean() for column in columns if len(column) > 2]
+    products = sum(float((column[1:] * column[:-1]).sum()) for column in centred)
+    squares = sum(float(column.square().sum()) for column in centred)
+    return squares > 0 and products > SMOOTH * squares
+
+
+def aligned(demonstrations: Demonstrations, names: Sequence[str], units: Sequence[str]) -> Demonstrations:
+    """Put columns in the order of ``names``, and convert them to ``units``; a note says what was changed.
+
+    Columns that are only numbered have no names, and an empty unit is unknown.
+
+    Raises:
+        UserError: for a missing or foreign name, or a unit that cannot be converted.
+    """
+    given, expected = demonstrations.state_names, tuple(names)
+    if given != expected and not _numbered(given) and not _numbered(expected):
+        missing = [name for name in expected if name not in given]
+        foreign = [name for name in given if name not in expected]
+        wanted = f"{short(', '.join(expected), 80)}, the model's"
+        found = f"{short(', '.join(given), 80)}; rename or reorder the columns"
+        require(not missing and not foreign and len(set(given)) == len(given), "key 'state_names'", wanted, found)
+        order = [given.index(name) for name in expected]
+        note(f"columns {short(', '.join(given), 80)} are put in the model's order {short(', '.join(expected), 80)}")
+        kinds = tuple(demonstrations.state_kinds[column] for column in order) if demonstrations.state_kinds else ()
+        demonstrations = replace(
+            demonstrations,
+            states=demonstrations.states[..., order],
+            state_names=expected,
+            state_units=tuple(demonstrations.state_units[column] for column in order),
+            state_kinds=kinds,
+        )
+    factors = [_factor(name, *pair) for name, *pair in zip(expected, demonstrations.state_units, units, strict=True)]
+    if any(factor != 1 for factor in factors):
+        changed = ", ".join(
+            f"{name} from {unit} to {wanted}"
+            for name, unit, wanted, factor in zip(expected, demonstrations.state_units, units, factors, strict=True)
+            if factor != 1
+        )
+        note(f"columns are converted to the model's units: {short(changed, 120)}")
+        states = demonstrations.states.double() * torch.tensor(factors, dtype=torch.double)
+        demonstrations = replace(demonstrations, states=states.to(demonstrations.states.dtype))
+    return replace(demonstrations, state_names=expected, state_units=tuple(units))
+
+
+def _numbered(names: Sequence[str]) -> bool:
+    return tuple(names) == tuple(map(str, range(len(names))))
+
+
+def _factor(name: str, unit: str, wanted: str) -> float:
+    """Factor from a unit to the wanted unit."""
+    if unit == wanted or not unit or not wanted:
+        return 1.0
+    (quantity, factor), (other, divisor) = UNITS.get(unit, (unit, 1.0)), UNITS.get(wanted, (wanted, 1.0))
+    known = quantity == other and unit in UNITS and wanted in UNITS
+    found = f"{short(unit, 30)!r}; convert the column"
+    require(known, f"key 'state_units': column {short(name, 40)!r}", f"{wanted!r}, the model's unit", found)
+    return factor / divisor

@@ -1,0 +1,370 @@
+"""Kinds of columns: conversion of angles, rotations and categories to continuous numbers and back.
+
+A file names the kind of each column in ``state_kinds``. A kind applies to a run of adjacent columns:
+
+==============  =========  ==========================================================  ==================
+kind            columns    learned as                                                  samples
+==============  =========  ==========================================================  ==================
+``linear``      1          itself                                                      any number
+``angle``       1          cosine and sine                                             within a turn
+``quaternion``  4          two rows of the rotation matrix (6-D, Zhou et al., 2019)     norm 1
+``rotation``    9, or 6    the first two rows (or columns) of the matrix                orthonormal
+``binary``      1          itself                                                      one of two values
+``category``    2 or more  themselves, one-hot                                         one-hot
+==============  =========  ==========================================================  ==================
+
+:func:`resolved` adds what samples need to come back as the data were: ``'angle -180 360 wraps'`` (lowest value, turn, and whether
+paths wrap), ``'quaternion 0 1'`` (component and its sign at the first time), ``'binary 0 1'`` (values), ``'category 3'`` (columns).
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ftl_lightning.services.errors import require, short
+
+LINEAR, ANGLE, QUATERNION, ROTATION, BINARY, CATEGORY = KINDS = (
+    *("linear", "angle", "quaternion", "rotation", "binary", "category"),
+)
+TURNS = {"rad": 2 * math.pi, "deg": 360.0}
+"""A whole turn by unit."""
+UNIT_NORM = 1e-3
+"""Maximum error of the norm of a quaternion, or of a row of a rotation matrix, and of their products."""
+WRAPPED, TURN = 0.8, (0.9, 1.001)
+"""Share of a turn that a step covers where an angle wraps; range of an angle's values, in turns, for it to be proposed."""
+RARE = 10.0
+"""Minimum number of steps for each wrap of an angle, and ratio of a wrap to twice the median step."""
+PAIRS = ((0.0, 1.0), (-1.0, 1.0))
+"""Values of columns that are proposed as binary."""
+
+
+@dataclass(frozen=True)
+class Group:
+    """Adjacent columns that are converted together.
+
+    Attributes:
+        kind: one of :data:`KINDS`.
+        first, count: first column and number of columns.
+        numbers: parameters of the kind, see this module; for an angle lowest value, turn, and 1 if paths wrap.
+    """
+
+    kind: str
+    first: int
+    count: int
+    numbers: tuple[float, ...] = ()
+
+    @property
+    def columns(self) -> slice:
+        """Columns of the group in a state."""
+        return slice(self.first, self.first + self.count)
+
+    @property
+    def width(self) -> int:
+        """Number of continuous columns."""
+        return {ANGLE: 2, QUATERNION: 6, ROTATION: 6}.get(self.kind, self.count)
+
+    @property
+    def texts(self) -> tuple[str, ...]:
+        """Entries of ``state_kinds``."""
+        return (" ".join([self.kind, *(f"{number:.17g}" for number in self.numbers)]),) * self.count
+
+    def encode(self, states: Tensor) -> Tensor:
+        """Convert columns ``(..., count)`` to continuous columns ``(..., width)``."""
+        if self.kind == ANGLE:
+            low, turn, _ = self.numbers
+            angle = (states - low) * (2 * math.pi / turn)
+            return torch.cat((angle.cos(), angle.sin()), dim=-1)
+        if self.kind == QUATERNION:
+            return _rows(states)
+        return states[..., : self.width]
+
+    def decode(self, encoded: Tensor) -> Tensor:
+        """Invert :meth:`encode` for paths ``(..., time, width)``, after projection to the nearest possible values."""
+        if self.kind == ANGLE:
+            return self._angle(encoded)
+        if self.kind == QUATERNION:
+            component, sign = self.numbers
+            return _signed(_quaternion(_matrix(encoded)), int(component), sign)
+        if self.kind == ROTATION:
+            return _matrix(encoded).flatten(-2)[..., : self.count]
+        if self.kind == BINARY:
+            low, high = self.numbers
+            return torch.where(encoded > (low + high) / 2, encoded.new_tensor(high), encoded.new_tensor(low))
+        if self.kind == CATEGORY:
+            return torch.nn.functional.one_hot(encoded.argmax(dim=-1), self.count).to(encoded)
+        return encoded
+
+    def _angle(self, encoded: Tensor) -> Tensor:
+        low, turn, wraps = self.numbers
+        angle = torch.atan2(encoded[..., 1:], encoded[..., :1]).remainder(2 * math.pi)
+        if not wraps and angle.shape[-2] > 1:
+            steps = (angle.diff(dim=-2) + math.pi).remainder(2 * math.pi) - math.pi
+            angle = torch.cat((angle[..., :1, :], steps), dim=-2).cumsum(dim=-2)
+        return low + angle * (turn / (2 * math.pi))
+
+
+class Columns:
+    """Conversion of states to continuous columns and back.
+
+    Args:
+        kinds: resolved entries of ``state_kinds``; empty if all columns are linear.
+    """
+
+    def __init__(self, kinds: Sequence[str]) -> None:
+        self.groups = tuple(_groups(kinds))
+
+    def __bool__(self) -> bool:
+        """Whether any column is not linear."""
+        return any(group.kind != LINEAR for group in self.groups)
+
+    @property
+    def width(self) -> int:
+        """Number of continuous columns."""
+        return sum(group.width for group in self.groups)
+
+    def encode(self, states: Tensor) -> Tensor:
+        """Convert states ``(..., state)`` to continuous columns ``(..., width)``."""
+        return torch.cat([group.encode(states[..., group.columns]) for group in self.groups], dim=-1) if self else states
+
+    def decode(self, encoded: Tensor) -> Tensor:
+        """Invert :meth:`encode` for paths ``(..., time, width)``; values are projected to the nearest possible ones."""
+        parts = encoded.split([group.width for group in self.groups], dim=-1) if self else ()
+        return torch.cat([group.decode(part) for group, part in zip(self.groups, parts, strict=True)], dim=-1) if self else encoded
+
+    def names(self, names: Sequence[str]) -> tuple[str, ...]:
+        """Names of the continuous columns."""
+        if not self:
+            return tuple(names)
+        made: list[str] = []
+        for group in self.groups:
+            part = names[group.columns]
+            if group.kind == ANGLE:
+                made += [f"cosine of {part[0]}", f"sine of {part[0]}"]
+            elif group.kind == QUATERNION:
+                made += [f"rotation of {part[0]} {number}" for number in range(6)]
+            else:
+                made += part[: group.width]
+        return tuple(made)
+
+    def notes(self, names: Sequence[str]) -> Iterator[str]:
+        """A line for each group that is not linear."""
+        for group in self.groups:
+            if group.kind != LINEAR:
+                part = short(", ".join(names[group.columns]), 60)
+                turn = f" with a turn of {group.numbers[1]:.6g}" if group.kind == ANGLE else ""
+                yield f"{'column' if group.count == 1 else 'columns'} {part}: {group.kind}{turn}"
+
+
+def declared(names: Sequence[str], of_file: Sequence[str], given: Mapping[str, str], place: str) -> tuple[str, ...]:
+    """Kind of each column as declared, empty where it is not.
+
+    Args:
+        names: names of the columns.
+        of_file: ``state_kinds`` of the file; may be empty.
+        given: kinds by the name of a column, or of several separated by commas; they replace those of the file.
+        place: option in messages.
+
+    Raises:
+        UserError: for an unknown name or kind.
+    """
+    kinds = list(of_file or ("",) * len(names))
+    for key, kind in given.items():
+        for name in (part.strip() for part in key.split(",")):
+            require(name in names, place, f"names among {short(', '.join(names), 120)}", repr(short(name)))
+            kinds[names.index(name)] = kind
+    for kind in kinds:
+        require((kind.split() or [LINEAR])[0] in KINDS, place, f"one of {', '.join(KINDS)}", repr(short(kind)))
+    return tuple(kinds)
+
+
+def resolved(
+    paths: Sequence[Tensor], names: Sequence[str], units: Sequence[str], kinds: Sequence[str], place: str
+) -> tuple[str, ...]:
+    """Complete declared kinds by what the data show, and propose kinds for the other columns.
+
+    Args:
+        paths: states ``(time, state)`` of each demonstration, without padding.
+        names, units: of each column.
+        kinds: declared kinds, empty where none is.
+        place: file or option in messages.
+
+    Returns:
+        Resolved kind of each column; empty if all columns are linear.
+
+    Raises:
+        UserError: naming the columns, if values contradict a declared kind.
+    """
+    every = torch.cat(list(paths)).double()
+    groups: list[Group] = []
+    column = 0
+    while column < len(names):
+        group = _declared_group(paths, every, names, units, kinds, column, place) if kinds[column] else None
+        group = group or _proposed(paths, every, units, kinds, column)
+        groups.append(group)
+        column += group.count
+    return tuple(text for group in groups for text in group.texts) if any(group.kind != LINEAR for group in groups) else ()
+
+
+def _groups(kinds: Sequence[str]) -> Iterator[Group]:
+    column = 0
+    while column < len(kinds):
+        kind, *rest = kinds[column].split()
+        numbers = tuple(map(float, rest))
+        group = Group(kind, column, _size(kind, numbers), numbers)
+        yield group
+        column += group.count
+
+
+def _size(kind: str, numbers: Sequence[float]) -> int:
+    """Number of columns of a resolved kind."""
+    return {QUATERNION: 4}.get(kind) or (int(numbers[0]) if kind in (CATEGORY, ROTATION) else 1)
+
+
+def _declared_group(
+    paths: Sequence[Tensor], every: Tensor, names: Sequence[str], units: Sequence[str], kinds: Sequence[str], first: int, place: str
+) -> Group:
+    kind, *rest = kinds[first].split()
+    run = next((at for at in range(first, len(kinds)) if kinds[at] != kinds[first]), len(kinds)) - first
+    if rest:  # resolved before
+        numbers = tuple(map(float, rest))
+        return Group(kind, first, _size(kind, numbers), numbers)
+    what = f"{place}: column {short(names[first], 40)!r}"
+    if kind == ANGLE:
+        return Group(kind, first, 1, _turn(paths, first, TURNS.get(units[first], 0.0)))
+    if kind == QUATERNION:
+        require(run % 4 == 0, what, "4 columns of a quaternion", f"{run} in a row")
+        require(_unit(every[:, first : first + 4]), what, "quaternions of norm 1", "others; normalise them")
+        return Group(kind, first, 4, _sign(paths, first))
+    if kind == ROTATION:
+        size = next((size for size in (9, 6) if run % size == 0), 0)
+        require(size, what, "9 columns of a rotation matrix, or its first two rows (6)", f"{run} in a row")
+        require(_orthonormal(every[:, first : first + size]), what, "orthonormal rows with determinant 1", "others")
+        return Group(kind, first, size, (size,))
+    if kind == BINARY:
+        values = every[:, first].unique().tolist()
+        require(len(values) == 2, what, "two values", f"{len(values)}")
+        return Group(kind, first, 1, tuple(values))
+    if kind == CATEGORY:
+        size = _one_hot(every, first, run)
+        require(size, what, "columns of 0 and 1 of which one is 1 at each time (one-hot)", "others")
+        return Group(kind, first, size, (size,))
+    return Group(LINEAR, first, 1)
+
+
+def _proposed(paths: Sequence[Tensor], every: Tensor, units: Sequence[str], kinds: Sequence[str], first: int) -> Group:
+    """Group from ``first`` on that the data show, among columns without a declared kind; linear if they show none."""
+    free = next((at for at in range(first, len(kinds)) if kinds[at]), len(kinds)) - first
+    rest = every[:, first : first + free]
+    if free >= 2 and (size := _one_hot(every, first, free)):
+        return Group(CATEGORY, first, size, (size,))
+    if free >= 9 and _orthonormal(rest[:, :9]) and _moves(rest[:, :9]):
+        return Group(ROTATION, first, 9, (9,))
+    if free >= 4 and _unit(rest[:, :4]) and _moves(rest[:, :4], 2):
+        return Group(QUATERNION, first, 4, _sign(paths, first))
+    if free and tuple(rest[:, 0].unique()[:3].tolist()) in PAIRS:
+        return Group(BINARY, first, 1, tuple(rest[:, 0].unique().tolist()))
+    for unit, turn in TURNS.items():
+        if free and units[first] in ("", unit) and wraps([path[:, first] for path in paths], turn):
+            return Group(ANGLE, first, 1, _turn(paths, first, turn))
+    return Group(LINEAR, first, 1)
+
+
+def wraps(columns: Sequence[Tensor], turn: float) -> bool:
+    """Whether angles ``(time,)`` of several demonstrations fill a turn, and jump from end to end in rare steps."""
+    values, steps = torch.cat(list(columns)), [column.diff().abs() for column in columns]
+    width, sizes = float(values.max() - values.min()) / turn, torch.cat(steps)
+    moving = sizes[sizes > 0]
+    jumps = [int((part > WRAPPED * turn).sum()) for part in steps]
+    if not TURN[0] <= width <= TURN[1] or sum(1 for count in jumps if count) < 2:
+        return False
+    return sum(jumps) * RARE < len(moving) and float(sizes.max()) > 2 * RARE * float(moving.median())
+
+
+def _turn(paths: Sequence[Tensor], column: int, turn: float) -> tuple[float, float, float]:
+    """Lowest value, whole turn (by the range of values unless given), and 1 if paths wrap."""
+    values = torch.cat([path[:, column] for path in paths]).double()
+    turn = turn or (360.0 if float(values.abs().max()) > 2 * TURNS["rad"] else TURNS["rad"])
+    jumps = any(bool((path[:, column].diff().abs() > turn / 2).any()) for path in paths)
+    return (0.0 if float(values.min()) >= 0 else -turn / 2), turn, float(jumps or float(values.max() - values.min()) <= turn)
+
+
+def _sign(paths: Sequence[Tensor], first: int) -> tuple[float, float]:
+    """Component with the largest mean size at the first time, and its more frequent sign."""
+    starts = torch.stack([path[0, first : first + 4] for path in paths]).double()
+    component = int(starts.abs().mean(dim=0).argmax())
+    return float(component), 1.0 if float(starts[:, component].sign().sum()) >= 0 else -1.0
+
+
+def _unit(values: Tensor) -> bool:
+    """Whether rows ``(time, n)`` have norm 1."""
+    return bool(((values.square().sum(dim=-1) - 1).abs() <= 2 * UNIT_NORM).all())
+
+
+def _orthonormal(values: Tensor) -> bool:
+    """Whether rows ``(time, 9 or 6)`` are orthonormal vectors of three numbers, of a matrix with determinant 1."""
+    rows = values.unflatten(-1, (-1, 3))
+    products = rows @ rows.transpose(-1, -2) - torch.eye(rows.shape[-2], dtype=rows.dtype)
+    proper = rows.shape[-2] < 3 or bool((torch.linalg.det(rows) > 0).all())
+    return proper and bool((products.abs() <= 2 * UNIT_NORM).all())
+
+
+def _moves(values: Tensor, least: int = 1) -> bool:
+    """Whether at least some columns ``(time, n)`` vary."""
+    return int((values.amax(dim=0) - values.amin(dim=0) > UNIT_NORM).sum()) >= least
+
+
+def _one_hot(every: Tensor, first: int, most: int) -> int:
+    """Number of adjacent columns from ``first`` on, at most ``most``, that are one-hot and vary; 0 without any."""
+    columns = every[:, first : first + most]
+    zero_or_one = ((columns == 0) | (columns == 1)).all(dim=0).tolist()
+    width = next((at for at, binary in enumerate(zero_or_one) if not binary), len(zero_or_one))
+    sums = columns[:, :width].cumsum(dim=1)
+    for size in range(2, width + 1):
+        if bool((sums[:, size - 1] == 1).all()):
+            return size if bool(columns[:, :size].any(dim=0).sum() > 1) else 0
+    return 0
+
+
+def _rows(quaternions: Tensor) -> Tensor:
+    """First two rows ``(..., 6)`` of the rotation matrices of quaternions ``(..., 4)``, scalar first."""
+    w, x, y, z = torch.nn.functional.normalize(quaternions, dim=-1).unbind(-1)
+    first = (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y))
+    second = (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x))
+    return torch.stack((*first, *second), dim=-1)
+
+
+def _matrix(rows: Tensor) -> Tensor:
+    """Rotation matrices ``(..., 3, 3)`` from two rows ``(..., 6)`` by the Gram-Schmidt process."""
+    first = torch.nn.functional.normalize(rows[..., :3], dim=-1)
+    rest = rows[..., 3:6]
+    second = torch.nn.functional.normalize(rest - (first * rest).sum(dim=-1, keepdim=True) * first, dim=-1)
+    return torch.stack((first, second, torch.linalg.cross(first, second)), dim=-2)
+
+
+def _quaternion(matrices: Tensor) -> Tensor:
+    """Quaternions ``(..., 4)``, scalar first, of rotation matrices ``(..., 3, 3)``, by the largest component."""
+    m = matrices.flatten(-2).unbind(-1)
+    diagonal = (1 + m[0] + m[4] + m[8], 1 + m[0] - m[4] - m[8], 1 - m[0] + m[4] - m[8], 1 - m[0] - m[4] + m[8])
+    a, b, c = m[7] - m[5], m[2] - m[6], m[3] - m[1]
+    d, e, f = m[3] + m[1], m[2] + m[6], m[7] + m[5]
+    candidates = torch.stack(
+        [
+            torch.stack(row, dim=-1)
+            for row in ((diagonal[0], a, b, c), (a, diagonal[1], d, e), (b, d, diagonal[2], f), (c, e, f, diagonal[3]))
+        ],
+        dim=-2,
+    )
+    largest = torch.stack(diagonal, dim=-1).argmax(dim=-1)
+    chosen = candidates.gather(-2, largest[..., None, None].expand(*largest.shape, 1, 4)).squeeze(-2)
+    return torch.nn.functional.normalize(chosen, dim=-1)
+
+
+def _signed(quaternions: Tensor, component: int, sign: float) -> Tensor:
+    """Quaternions ``(..., time, 4)`` whose component has the sign at the first time, and that change sign nowhere after."""
+    start = torch.where(quaternions[..., :1, component] * sign < 0, -1.0, 1.0)
+    steps = (quaternions[..., 1:, :] * quaternions[..., :-1, :]).sum(dim=-1)
+    signs = torch.cat((start, torch.where(steps < 0, -1.0, 1.0)), dim=-1).cumprod(dim=-1)
+    return quaternions * signs[..., None].to(quaternions)
