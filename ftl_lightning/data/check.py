@@ -13,7 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ftl_lightning.data.demonstrations import Demonstrations, read_contents
+from ftl_lightning.data.demonstrations import Demonstrations, paths_of, read_contents
+from ftl_lightning.data.kinds import Columns, resolved
 from ftl_lightning.services.errors import about, short
 
 T = TypeVar("T")
@@ -32,6 +33,9 @@ UNITS = 10.0  # ratio of values that suggests other units
 APART = {3: 25.0, 4: 12.0}  # ratio to the usual distance that makes an outlier, by the number of demonstrations
 APART_PLACES, APART_SHAPES = 12.0, 4.0  # ratios for five and more: of states, and of their shapes regardless of place and size
 CLOSEST = {3: 0.5}  # minimum usual distance, as a share of the others' spread, by the number of demonstrations; otherwise 0.1
+MOST_CHECKED, MOST_LINES = 2000, 2  # demonstrations that are checked before pretraining, and lines of findings
+LEAST_AXIS = 5  # more entries of an axis than this make it a possible time
+SMOOTH_AXIS, EXCHANGED = 0.6, 3.0  # maximum roughness of an exchanged time axis, and minimum ratio of the other's to it
 BEYOND = 1.5  # minimum ratio of an outlier's least distance to the others' largest, for five and more
 
 
@@ -104,7 +108,7 @@ def read_mended(path: str) -> tuple[Demonstrations, tuple[Finding, ...]]:
     contents = read_contents(path)
     findings: tuple[Finding, ...] = ()
     states, lengths = contents["states"], contents["lengths"]
-    if states.dim() == 3 and states.dtype == torch.float32 and lengths.shape == states.shape[:1]:
+    if states.dim() == 3 and states.is_floating_point() and lengths.shape == states.shape[:1]:
         contents["states"], findings = mended(states, lengths)
     with about(path):
         return Demonstrations(**contents).named(Path(path).stem), findings
@@ -116,7 +120,8 @@ def check(demonstrations: Demonstrations) -> tuple[Finding, ...]:
     A demonstration with a finding is excluded from later checks.
     """
     few = Finding("three to five demonstrations are usual; fewer do not show which of them is odd", "note")
-    findings = [*([few] if len(demonstrations) < 3 else []), *_constant(demonstrations)]
+    demonstrations, kinds = _continuous(demonstrations)
+    findings = [*([few] if len(demonstrations) < 3 else []), *kinds, *axes(demonstrations), *_constant(demonstrations)]
     remaining = list(range(len(demonstrations)))
     for look in (_lengths, _stills, _units, _duplicates, _jumps, _outliers):
         reported = [finding.among(remaining) for finding in look(demonstrations.rows(remaining))]
@@ -126,6 +131,64 @@ def check(demonstrations: Demonstrations) -> tuple[Finding, ...]:
     return tuple(sorted(findings, key=lambda finding: finding.severity == "note"))
 
 
+def check_each(demonstrations: Demonstrations) -> list[str]:
+    """Faults that :func:`check` finds in each concept, in at most :data:`MOST_LINES` lines.
+
+    Of many demonstrations only the first are checked, :data:`MOST_CHECKED` in all.
+
+    Args:
+        demonstrations: of any number of concepts.
+    """
+    found = [str(finding) for finding in axes(demonstrations)]
+    names = tuple(dict.fromkeys(demonstrations.concepts))
+    each = max(MOST_CHECKED // len(names), 3)
+    for name in names[:MOST_CHECKED] if not found else ():
+        part = demonstrations.select(name)
+        some = part.rows(list(range(min(len(part), each))))
+        found += [f"{short(name, 40)}: {finding}" for finding in check(some) if finding.severity != "note"]
+    more = len(found) - MOST_LINES
+    return found if more <= 0 else [*found[: MOST_LINES - 1], f"{more + 1} more; list them: python -m ftl_lightning check"]
+
+
+def axes(demonstrations: Demonstrations) -> Iterator[Finding]:
+    """Find a likely exchange of axes: states are much smoother along demonstrations or columns than along time."""
+    shape = tuple(demonstrations.states.shape)
+    if min(shape) < 2 or demonstrations.state_kinds != ():
+        return
+    states = demonstrations.states.double()
+    demo, time, column = (_roughness(states, axis) for axis in range(3))
+    for other, rough, order in ((0, demo, (1, 0, 2)), (2, column, (0, 2, 1))):
+        if shape[other] > LEAST_AXIS and rough < SMOOTH_AXIS and time > EXCHANGED * rough:
+            suggested = f"(demo, time, column) of shape {tuple(shape[axis] for axis in order)}: transpose{order}"
+            yield Finding(f"axes are likely exchanged: states {shape} are smooth along axis {other}, not along time; {suggested}")
+            return
+
+
+def _roughness(states: Tensor, axis: int) -> float:
+    """Median over rows of the root mean square step along an axis, relative to the standard deviation along it."""
+    steps = states.diff(dim=axis).square().mean(dim=axis).sqrt()
+    spread = states.std(dim=axis, correction=0)
+    varies = spread > SAME * states.abs().max()
+    return float((steps[varies] / spread[varies]).median()) if bool(varies.any()) else 0.0
+
+
+def _continuous(demonstrations: Demonstrations) -> tuple[Demonstrations, list[Finding]]:
+    """Demonstrations with continuous columns of their kinds, which are proposed unless known, and findings about proposals."""
+    names, kinds, findings = demonstrations.state_names, demonstrations.state_kinds, list[Finding]()
+    if not kinds:
+        kinds = resolved(paths_of(demonstrations), names, demonstrations.state_units, ("",) * len(names), "states")
+        findings = [Finding(text, "note") for text in Columns(kinds).notes(names)]
+    columns, double = Columns(kinds), demonstrations.states.dtype == torch.float64
+    if not columns and not double:
+        return demonstrations, findings
+    states = columns.encode(demonstrations.states)
+    if double:  # offsets hide movement
+        states = states - torch.cat([path[:1] for path in paths_of(replace(demonstrations, states=states))]).mean(dim=0)
+    names = columns.names(names)
+    units = ("",) * len(names)
+    return replace(demonstrations, states=states.float(), state_names=names, state_units=units, state_kinds=()), findings
+
+
 def distances(demonstrations: Demonstrations) -> Tensor:
     """Distances ``(demo, demo)``: root mean square over even times and columns scaled by their spread."""
     points = _points(_paths(demonstrations))
@@ -133,9 +196,8 @@ def distances(demonstrations: Demonstrations) -> Tensor:
 
 
 def _paths(demonstrations: Demonstrations) -> list[Tensor]:
-    """States ``(time, state)`` of each demonstration without padding."""
-    lengths = demonstrations.lengths.tolist()
-    return [states[:length].double() for states, length in zip(demonstrations.states, lengths, strict=True)]
+    """States ``(time, state)`` of each demonstration in float64, without padding."""
+    return [path.double() for path in paths_of(demonstrations)]
 
 
 def _points(paths: list[Tensor]) -> Tensor:

@@ -85,7 +85,7 @@ def configuration(
 ) -> dict[str, Any]:
     """Description of an evaluated configuration: every option that values depend on, defaults included.
 
-    Folders are not part of it; the pretrained model and files of demonstrations are given by their hash.
+    Folders and reports are not part of it; the pretrained model and files of demonstrations are given by their hash.
 
     Args:
         module: evaluated module.
@@ -98,7 +98,7 @@ def configuration(
     files = {key: options[key] and _identity(options[key]) for key in ("demonstrations", "more") if key in options}
     groups: dict[str, Mapping[str, Any]] = {
         "model": {key: value for key, value in model.items() if key not in ("pretrained", "output")},
-        "data": {key: value for key, value in options.items() if key not in ("domain", "root")} | files,
+        "data": {key: value for key, value in options.items() if key not in ("domain", "root", "check")} | files,
         "evaluation": settings,
         "trainer": getattr(trainer, "unusual", {}) if "pretrained" in model else {},
         # Values of trained metrics depend on their weights.

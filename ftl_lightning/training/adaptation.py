@@ -117,7 +117,7 @@ class Adaptation(pl.LightningModule, ABC):
         if self.model.examples is not None:  # a user's data: new concepts are judged by their demonstrations
             self.domain = judging_domain(self.model, [self.model.examples, self.demonstrations])
         longer = longer_than_plans(self.demonstrations, self.model)
-        for note in notes_of(self.model, self.demonstrations) if self._of_user else [longer] if longer else []:
+        for note in notes_of(self.model, self.demonstrations) if self._of_user and data.check else [longer] if longer else []:
             say(f"note: {note}", error=True)
 
     def training_step(self, batch: int) -> None:

@@ -14,13 +14,14 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset
 
+from ftl_lightning.data.check import check_each
 from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.data.features import check_features
 from ftl_lightning.domains.domain import OWN, Domain, Recoveries
 from ftl_lightning.domains.from_file import domain_from_file, read_demonstrations, read_own
 from ftl_lightning.domains.registry import load_domain, recorded_name
 from ftl_lightning.networks.text_encoder import Encoder, load_encoder
-from ftl_lightning.services.errors import UserError, require, short
+from ftl_lightning.services.errors import UserError, note, require, short
 from ftl_lightning.services.randomness import DEMONSTRATION_SEED, drawn, generator, rows_of
 from ftl_lightning.services.validation import LARGEST_STEP, MOST_TOGETHER, check_count, check_factor, check_range
 
@@ -243,6 +244,7 @@ class OwnData(PretrainingData):
         metrics: metrics of plans, number by name, see :mod:`ftl_lightning.domains.from_file`; empty for none.
         kinds: kinds of columns by name, such as ``{heading: angle}``, see :mod:`ftl_lightning.data.kinds`; other columns have the
             kind that the file declares or the data show.
+        check: whether likely faults of the demonstrations are reported before training.
         validation_share: share of each concept's demonstrations to hold out, at least a single demonstration.
         seed, batch_size, steps_per_epoch, encoder, revision: see :class:`PretrainingData`; the default encoder is ``'minilm'``
             where it is installed, else ``'hashing'``.
@@ -257,6 +259,7 @@ class OwnData(PretrainingData):
         demonstrations: str,
         metrics: dict[str, float] | None = None,
         kinds: dict[str, str] | None = None,
+        check: bool = True,
         validation_share: float = 0.1,
         seed: int = 0,
         batch_size: int = 128,
@@ -268,7 +271,7 @@ class OwnData(PretrainingData):
     ) -> None:
         require(0 < validation_share < 1, "data.validation_share", "a share between 0 and 1", validation_share)
         self._file, self._share, self._metrics, self._horizon = demonstrations, validation_share, dict(metrics or {}), horizon
-        self._kinds = dict(kinds or {})
+        self._kinds, self._check = dict(kinds or {}), check
         super().__init__(
             domain=OWN,
             seed=seed,
@@ -284,6 +287,12 @@ class OwnData(PretrainingData):
 
     def _domain(self, name: str) -> tuple[str, Domain]:
         return OWN, domain_from_file(self._file, self._horizon, self._metrics, self._share, self._kinds)
+
+    def setup(self, stage: str) -> None:
+        super().setup(stage)
+        if self._check and stage == "fit":
+            for text in check_each(self.training):
+                note(f"{self._file}: {text}; --data.check false turns this off")
 
     @property
     def view(self) -> str:
@@ -308,6 +317,7 @@ class InversionData(pl.LightningDataModule):
         seed: seed of the drawn demonstrations.
         steps: gradient steps.
         root: folder of the user's copy of the data, for domains whose demonstrations do not ship.
+        check: whether likely faults of demonstrations from a file are reported before learning.
 
     Raises:
         UserError: for an invalid value, or a file that does not fit the domain.
@@ -322,6 +332,7 @@ class InversionData(pl.LightningDataModule):
         seed: int = 0,
         steps: int = 400,
         root: str | None = None,
+        check: bool = True,
     ) -> None:
         super().__init__()
         self.save_hyperparameters()
@@ -332,6 +343,7 @@ class InversionData(pl.LightningDataModule):
         self.steps = steps
         self.root = None if root is None else Path(root)
         self.of_user = demonstrations is not None
+        self.check = check
         self.domain_name = domain if domain == OWN else recorded_name(domain)
         if demonstrations is None and domain == OWN:
             raise UserError("data.demonstrations: expected a file of the new concepts' demonstrations, found none")
