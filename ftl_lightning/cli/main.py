@@ -13,7 +13,7 @@ from omegaconf.errors import OmegaConfBaseException
 from ftl_lightning.cli import concepts, demonstrations, experiments, pages, sample
 from ftl_lightning.services import trust
 from ftl_lightning.services.command_line import TRAINER, Arguments, check_inputs, command_checks, one_line
-from ftl_lightning.services.errors import UserError, mistake_of_machine, require
+from ftl_lightning.services.errors import LONGEST, UserError, mistake_of_machine, require, short
 from ftl_lightning.services.text import any_terminal, line, say
 from ftl_lightning.version import __version__
 
@@ -143,7 +143,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _refused(message: str) -> int:
-    say("error:", line(message), error=True)
+    say("error:", short(line(message), LONGEST - len("error: ")), error=True)
     return 2
 
 

@@ -37,9 +37,13 @@ def silence() -> None:
 
 
 def say(*parts: object, error: bool = False) -> None:
-    """Print values by :func:`plain` at once, separated by spaces, to standard output or standard error."""
+    """Print values by :func:`plain` at once, separated by spaces, to standard output or standard error.
+
+    Errors and notes are a single line each, shortened to twice :data:`~ftl_lightning.services.errors.LONGEST`.
+    """
     if not _silent:
-        print(*(plain(str(part)) for part in parts), file=sys.stderr if error else sys.stdout, flush=True)
+        text = " ".join(map(str, parts))
+        print(plain(short(text, 2 * LONGEST) if error else text), file=sys.stderr if error else sys.stdout, flush=True)
 
 
 def any_terminal() -> None:
