@@ -23,10 +23,17 @@ _DAMAGED = (pa.ArrowException, OSError, ValueError, TypeError, KeyError, IndexEr
 """Exceptions of pyarrow for damaged or foreign files."""
 MOST_TASKS = 100_000
 """Maximum number of texts of tasks."""
+MOST_TASK_BYTES = 8 * 2**20
+"""Maximum bytes of all texts of tasks."""
 
 
 def read_columns(
-    root: Path, pattern: str, shapes: Mapping[str, tuple[int, ...]], whole: Collection[str], rows: int | None = None
+    root: Path,
+    pattern: str,
+    shapes: Mapping[str, tuple[int, ...]],
+    whole: Collection[str],
+    optional: Collection[str] = (),
+    rows: int | None = None,
 ) -> dict[str, NDArray[Any]]:
     """Read and concatenate columns of the files below ``root`` that match a pattern.
 
@@ -34,7 +41,8 @@ def read_columns(
         root, pattern: folder, and pattern of its files.
         shapes: shape of a row of each column, by name; a shape of one number may be stored without a list.
         whole: names of columns of whole numbers (int64).
-        rows: number of rows of all files; ``None`` for any.
+        optional: names of columns that are left out if the first file lacks them.
+        rows: maximum number of rows of all files; ``None`` for the limit of memory.
 
     Returns:
         Numbers by name, ``(row, *shape)``, or ``(row,)`` if whole; missing numbers are NaN.
@@ -47,9 +55,11 @@ def read_columns(
     packed, size, actual = sum(check_readable(path, "Parquet") for path in paths), 0, 0
     for path in paths:
         with _opened(path) as file:
+            if path == paths[0]:
+                shapes = {name: shape for name, shape in shapes.items() if name not in {*optional} - {*file.schema_arrow.names}}
             size += _checked_size(path, file, shapes)
             actual += file.metadata.num_rows
-    require(rows in (None, actual), f"{root}: {pattern}", f"{rows} rows, as info.json says", str(actual))
+    require(rows is None or actual <= rows, str(root / pattern), f"at most {rows} rows", str(actual))
     with about(root):
         check_unpacked(size, packed, "frames")
     parts: dict[str, list[NDArray[Any]]] = {name: [] for name in shapes}
@@ -67,10 +77,10 @@ def read_texts(path: Path, number: str, name: str) -> dict[int, str]:
     Raises:
         UserError: naming the file, if it is missing, damaged, too large, or lacks the columns.
     """
-    packed = check_readable(path, "tasks", MOST_TEXT)
+    packed = check_readable(path, "tasks", MOST_TASK_BYTES)
     with _opened(path) as file:
         size = sum(file.metadata.row_group(group).total_byte_size for group in range(file.num_row_groups))
-        require(size <= MOST_TEXT, str(path), f"texts of at most {MOST_TEXT} bytes", str(size))
+        require(size <= MOST_TASK_BYTES, str(path), f"texts of at most {MOST_TASK_BYTES} bytes", str(size))
         require(file.metadata.num_rows <= MOST_TASKS, str(path), f"at most {MOST_TASKS} tasks", str(file.metadata.num_rows))
         schema = file.schema_arrow
         texts = [field.name for field in schema if pa.types.is_string(field.type) or pa.types.is_large_string(field.type)]
@@ -78,9 +88,11 @@ def read_texts(path: Path, number: str, name: str) -> dict[int, str]:
         require(known, str(path), f"the columns {number!r} and {name!r}", short(", ".join(schema.names)))
         columns, named, decoded = [number, name if name in texts else texts[0]], {}, 0
         # A text that is stored once stands for many rows. No row is larger than all that is stored, so batches stay small.
-        for batch in file.iter_batches(max(1, MOST_TEXT // max(size, packed)), columns=columns):
+        for batch in file.iter_batches(max(1, MOST_TASK_BYTES // max(size, packed)), columns=columns):
             decoded += batch.nbytes
-            require(decoded <= MOST_TEXT, str(path), f"texts of at most {MOST_TEXT} bytes", "more when they are decoded")
+            require(
+                decoded <= MOST_TASK_BYTES, str(path), f"texts of at most {MOST_TASK_BYTES} bytes", "more when they are decoded"
+            )
             keys, values = (batch.column(column).to_pylist() for column in columns)
             named |= {key: text for key, text in zip(keys, values, strict=True) if text is not None}
         return named
