@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,13 +39,14 @@ class Frames:
 
     def rows(self, order: NDArray[np.int64]) -> "Frames":
         """Frames in another order."""
-        number, seconds = (None if key is None else key[order] for key in (self.number, self.seconds))
+        number = None if self.number is None else self.number[order]
+        seconds = None if self.seconds is None else self.seconds[order]
         return Frames(self.episode[order], self.task[order], number, seconds)
 
     def segments(self) -> list[tuple[int, int]]:
         """First frame and end of each part of an episode with a single task, of sorted frames."""
         ends = [0, *(np.flatnonzero(~self._within | (np.diff(self.task) != 0)) + 1).tolist(), len(self.episode)]
-        return list(zip(ends[:-1], ends[1:], strict=True))
+        return list(pairwise(ends))
 
     @property
     def _within(self) -> Flags:

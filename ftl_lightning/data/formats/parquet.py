@@ -80,7 +80,8 @@ def read_texts(path: Path, number: str, name: str) -> dict[int, str]:
     packed = check_readable(path, "tasks", MOST_TASK_BYTES)
     with _opened(path) as file:
         size = sum(file.metadata.row_group(group).total_byte_size for group in range(file.num_row_groups))
-        require(size <= MOST_TASK_BYTES, str(path), f"texts of at most {MOST_TASK_BYTES} bytes", str(size))
+        expected = f"texts of at most {MOST_TASK_BYTES} bytes"
+        require(size <= MOST_TASK_BYTES, str(path), expected, str(size))
         require(file.metadata.num_rows <= MOST_TASKS, str(path), f"at most {MOST_TASKS} tasks", str(file.metadata.num_rows))
         schema = file.schema_arrow
         texts = [field.name for field in schema if pa.types.is_string(field.type) or pa.types.is_large_string(field.type)]
