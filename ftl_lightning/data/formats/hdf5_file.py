@@ -41,7 +41,8 @@ def _checked_size(file: h5py.File) -> int:
         if len(names) >= raised(MOST_OBJECTS):
             return f"content: expected at most {raised(MOST_OBJECTS)} groups and arrays, found more"
         known.add(link.u)
-        return names.append(name)
+        names.append(name)
+        return None
 
     if message := file.id.links.visit(fault, info=True):  # an exception in the function would be lost
         raise UserError(message)

@@ -204,9 +204,10 @@ def _lengths_and_texts(root: Path, version: str) -> tuple[dict[int, int], dict[i
 
     meta = root / "meta"
     if not version.startswith("v3"):
-        lengths = read_lines(meta / "episodes.jsonl", {EPISODE: "int64", LENGTH: "int64"})
+        episodes = read_lines(meta / "episodes.jsonl", {EPISODE: "int64", LENGTH: "int64"})
         tasks = read_lines(meta / "tasks.jsonl", {TASK: "int64", "task": "string"})
-        return dict(zip(*lengths.values(), strict=True)), dict(zip(*tasks.values(), strict=True))
+        lengths, texts = (dict(zip(*rows.values(), strict=True)) for rows in (episodes, tasks))
+        return lengths, {number: text for number, text in texts.items() if text is not None}
     columns = read_columns(root, "meta/episodes/*/*.parquet", {EPISODE: (1,), LENGTH: (1,)}, (EPISODE, LENGTH), rows=LARGEST)
     lengths = dict(zip(columns[EPISODE].tolist(), columns[LENGTH].tolist(), strict=True))
     return lengths, read_texts(meta / "tasks.parquet", TASK, "task")

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from math import prod
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,7 +108,7 @@ def _check_metadata(folder: Path) -> None:
     episodes = check_type(content.get("total_episodes"), int, "total_episodes")
     for key in ("observation_space", "action_space"):  # without them, Minari makes the environment that the file names
         _check_space(json.loads(check_type(content.get(key), str, key)), key)
-    if content.get("data_format") == "hdf5":
+    if check_type(content.get("data_format"), Literal["hdf5", "arrow", "parquet"], "data_format") == "hdf5":
         return
     numbers = {path.name for path in folder.iterdir()}
     require(all(str(number) in numbers for number in range(episodes)), "total_episodes", "a folder for each", str(episodes))
@@ -174,10 +174,8 @@ def _check_tables(dataset: Any, folder: Path) -> None:
     kind, skipped = dataset.storage.FORMAT, ["_", ".", "metadata.json"]
     folders = [folder / str(number) for number in dataset.episode_indices]
     tables = (pyarrow.dataset.dataset(str(path), format=kind, ignore_prefixes=skipped) for path in folders)
-    spaces = [
-        part for space in (dataset.observation_space, dataset.action_space) for part in (parts_of(space) or {"": space}).values()
-    ]
-    width = sum(8 * prod(space.shape or ()) for space in spaces)
+    spaces = (parts_of(space) or {"": space} for space in (dataset.observation_space, dataset.action_space))
+    width = sum(8 * prod(part.shape or ()) for parts in spaces for part in parts.values())
     packed = sum(check_readable(path, "Minari") for part in folders for path in part.iterdir())
     check_unpacked(sum(table.count_rows() for table in tables) * width, packed, "episodes")
 
@@ -199,7 +197,8 @@ def _episode(number: int, episode: _Raw, spaces: Mapping[str, Any], text: str, w
 
 def _numbers(place: str, values: Any, space: Any) -> NDArray[Any]:
     """Read numbers ``(step, *shape)`` of a part, float32, or uint8 for images, whose space has the shape of a step."""
-    shape, kind = getattr(values, "shape", ()), getattr(getattr(values, "dtype", None), "kind", "O")
+    shape: tuple[int, ...] = getattr(values, "shape", ())
+    kind = getattr(getattr(values, "dtype", None), "kind", "O")
     require(kind in "fiub", place, "numbers", "nothing" if values is None else "others")
     require(len(shape) and shape[1:] == space.shape, place, f"steps of shape {space.shape}, as in metadata", str(shape[1:]))
     require(shape[0], place, "at least one step", "none")

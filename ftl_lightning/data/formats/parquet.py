@@ -87,7 +87,8 @@ def read_texts(path: Path, number: str, name: str) -> dict[int, str]:
         texts = [field.name for field in schema if pa.types.is_string(field.type) or pa.types.is_large_string(field.type)]
         known = number in schema.names and texts and pa.types.is_integer(schema.field(number).type)
         require(known, str(path), f"the columns {number!r} and {name!r}", short(", ".join(schema.names)))
-        columns, named, decoded = [number, name if name in texts else texts[0]], {}, 0
+        columns, decoded = [number, name if name in texts else texts[0]], 0
+        named: dict[int, str] = {}
         # A text that is stored once stands for many rows. No row is larger than all that is stored, so batches stay small.
         for batch in file.iter_batches(max(1, MOST_TASK_BYTES // max(size, packed)), columns=columns):
             decoded += batch.nbytes
