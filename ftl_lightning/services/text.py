@@ -98,6 +98,7 @@ _MARKDOWN = re.compile(
     """,
     re.VERBOSE | re.IGNORECASE,
 )
+_BEGINNING = re.compile(r"^(\d*)([#+=.)-])")
 _ENTITIES = {"<": "&lt;", ">": "&gt;", "&": "&amp;"}
 _SCRIPT = str.maketrans({letter: f"\\u{ord(letter):04x}" for letter in "<>&\u2028\u2029"})
 MOST_DRAWN = 120
@@ -118,6 +119,11 @@ def latex_row(cells: list[str]) -> str:
 def markdown(text: str) -> str:
     """Escape a text for a cell or caption in GitHub's Markdown: one line, no HTML, link, picture, formula, code or new cell."""
     return _MARKDOWN.sub(lambda match: _ENTITIES.get(match[0], f"\\{match[0]}"), line(text))
+
+
+def markdown_item(text: str) -> str:
+    """:func:`markdown` for an item of a list, which begins no heading, line or list of its own."""
+    return _BEGINNING.sub(r"\1\\\2", markdown(text))
 
 
 def script_json(content: Any) -> str:

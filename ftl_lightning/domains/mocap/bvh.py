@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ftl_lightning.domains.mocap import skeleton
-from ftl_lightning.domains.mocap.asf_amc import INCH, THORAX, Skeleton
+from ftl_lightning.domains.mocap.asf_amc import INCH, LARGEST, THORAX, Skeleton
 from ftl_lightning.domains.mocap.skeleton import FPS, as_joints, standing_poses
 from ftl_lightning.services.errors import UserError, require, short
 from ftl_lightning.services.files import read_text
@@ -25,8 +25,6 @@ MOST_NODES = 1000
 """Maximum number of joints and end sites; a hand with all its fingers has 20."""
 MOST_PLACES = 2_500_000
 """Maximum number of positions, frames times nodes: 240 MB of rotations."""
-LARGEST = 1e6
-"""Maximum magnitude of a position, an offset or an angle in degrees."""
 END = "EndSite"  # Prefix of the name of an end site, before its joint's name
 _POSITIONS = {f"{axis}position": number for number, axis in enumerate("XYZ")}
 _ROTATIONS = {f"{axis}rotation": number for number, axis in enumerate("XYZ")}
