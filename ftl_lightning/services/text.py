@@ -39,11 +39,12 @@ def silence() -> None:
 def say(*parts: object, error: bool = False) -> None:
     """Print values by :func:`plain` at once, separated by spaces, to standard output or standard error.
 
-    Errors and notes are a single line each, shortened to twice :data:`~ftl_lightning.services.errors.LONGEST`.
+    Errors and notes are shortened to a line of twice :data:`~ftl_lightning.services.errors.LONGEST`.
     """
     if not _silent:
         text = " ".join(map(str, parts))
-        print(plain(short(text, 2 * LONGEST) if error else text), file=sys.stderr if error else sys.stdout, flush=True)
+        text = short(text, 2 * LONGEST) if error and len(text) > 2 * LONGEST else text
+        print(plain(text), file=sys.stderr if error else sys.stdout, flush=True)
 
 
 def any_terminal() -> None:

@@ -73,9 +73,10 @@ def card(model: ConceptModel) -> str:
     """Model card with the Hub's metadata; names come from files, so they are escaped."""
     config = model.config
     texts = "\n".join(f"- {markdown_item(text)}" for text in config.training_concepts)
+    title = f"{markdown(model.method.name)} on {markdown(model.domain.name)}"
     return (
         "---\nlibrary_name: ftl-lightning\ntags: [few-shot-learning, diffusion, imitation-learning]\n---\n"
-        f"# {markdown(model.method.name)} on {markdown(model.domain.name)}\n\nHash {model.hash}; plans of {config.horizon} states of "
+        f"# {title}\n\nHash {model.hash}; plans of {config.horizon} states of "
         f"{config.state_dim} numbers. Text encoder: {markdown(config.encoder)}.\n\nTraining concepts:\n\n{texts}\n\n"
         '```python\nfrom ftl_lightning import FewShot\nmodel = FewShot.from_pretrained("FOLDER OR NAME")\n```\n\n'
         f"Files: `{CONFIG}`, `model.safetensors` (weights in half precision).\n"
