@@ -9,12 +9,16 @@ exception; the first case of each is printed), ``slow`` (more than 5 s), ``memor
 
 import argparse
 import collections
+import contextlib
 import copy
 import io
 import json
 import multiprocessing
+import os
 import random
+import re
 import resource
+import shutil
 import struct
 import tempfile
 import time
@@ -32,6 +36,9 @@ import torch
 import yaml
 
 from ftl_lightning.data.demonstrations import Demonstrations
+from ftl_lightning.domains.mocap.bvh import bvh
+from ftl_lightning.domains.mocap.prepare import demonstrated
+from ftl_lightning.domains.mocap.skeleton import standing_poses
 from ftl_lightning.evaluation.results import COLUMNS, latest, read_rows
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import Concept, Origin
@@ -263,6 +270,32 @@ def odd_csv(rows: list[list[str]], draw: random.Random) -> bytes:
     return flipped(content, draw) if draw.random() < 0.25 else content
 
 
+def odd_hdf5(path: Path, draw: random.Random) -> None:
+    """Put a link, another array or nothing in place of an object of an HDF5 file."""
+    import h5py
+
+    with h5py.File(path, "a") as file:
+        names: list[str] = []
+        file.visit(names.append)
+        name = draw.choice(names)
+        values = draw.choice((1.0, "text", [1, 2], [[1e300] * 2] * 6, ["a"] * 6, [True] * 6))
+        kinds: list[Callable[[], object]] = [
+            lambda: file.__setitem__(name, h5py.SoftLink(draw.choice(("/", "/episode_0", "/nowhere", name)))),
+            lambda: file.__setitem__(name, h5py.ExternalLink("/etc/hostname", "/x")),
+            lambda: file.__setitem__(name, file[draw.choice(("/", "/episode_1", "/episode_2/observations"))]),
+            lambda: file.create_dataset(name, (3, 2), "f4", external=[("/etc/hostname", 0, 24)]),
+            lambda: file.create_dataset(name, (10**10, 2), "f4"),
+            lambda: file.create_dataset(name, (10**9,), "f8", compression="gzip"),
+            lambda: file.create_dataset(name, data=values),
+            lambda: file.create_dataset(name, dtype="f4"),
+            lambda: file.create_group(name),
+            lambda: None,
+        ]
+        del file[name]
+        with contextlib.suppress(KeyError, ValueError, OSError, RuntimeError, TypeError):  # a link to what was deleted
+            draw.choice(kinds)()
+
+
 class Fuzz:
     """Good files of every kind, and how each kind is mutated, read and used."""
 
@@ -299,6 +332,9 @@ class Fuzz:
             "safetensors": self.safetensors,
             "npz": self.npz,
             "lerobot": self.lerobot,
+            "lerobot v2.1": self.lerobot_old,
+            "minari": self.minari,
+            "bvh": self.bvh,
             "csv": self.csv,
             "checkpoint": self.checkpoint,
             "yaml": self.yaml,
@@ -346,15 +382,68 @@ class Fuzz:
         folder = self.folder / "lerobot"
         if not folder.is_dir():
             Demonstrations.load(self.folder / "good.npz").save(f"lerobot:{folder}")
-        path = draw.choice(sorted(one for one in folder.rglob("*") if one.is_file()))
+        self._changed(folder, folder, draw)
+
+    def lerobot_old(self, draw: random.Random) -> None:
+        """The same of version 2.1, whose episodes and tasks are lines of JSON."""
+        folder = self.folder / "lerobot_old"
+        if not folder.is_dir():
+            Demonstrations.load(self.folder / "good.npz").save(f"lerobot:{folder}")
+            meta = folder / "meta"
+            content = json.loads((meta / "info.json").read_text())
+            (meta / "info.json").write_text(json.dumps(content | {"codebase_version": "v2.1"}))
+            episodes = [{"episode_index": number, "tasks": ["a"], "length": 6 - number} for number in range(3)]
+            (meta / "episodes.jsonl").write_text("".join(json.dumps(row) + "\n" for row in episodes))
+            tasks = [{"task_index": number, "task": text} for number, text in enumerate("abc")]
+            (meta / "tasks.jsonl").write_text("".join(json.dumps(row) + "\n" for row in tasks))
+            shutil.rmtree(meta / "episodes")
+            (meta / "tasks.parquet").unlink()
+        self._changed(folder, folder, draw)
+
+    def minari(self, draw: random.Random) -> None:
+        """The same as the folder of a Minari data set, one file of which is changed, or an object of its HDF5 file."""
+        os.environ["MINARI_DATASETS_PATH"] = str(self.folder)
+        folder = self.folder / "good-v0" / "data"
+        if not folder.is_dir():
+            Demonstrations.load(self.folder / "good.npz").save("minari:good-v0")
+        if draw.random() < 0.5:
+            self._changed(folder, "good-v0", draw)
+            return
+        path = folder / "main_data.hdf5"
         content = path.read_bytes()
-        path.write_bytes(as_json(json.loads(content), draw) if path.suffix == ".json" else _flipped_footer(content, draw))
         try:
-            self._used(folder)
+            odd_hdf5(path, draw)
+            self._used("good-v0")
         finally:
             path.write_bytes(content)
 
-    def _used(self, path: Path) -> None:
+    def bvh(self, draw: random.Random) -> None:
+        """Motion of a person, with words in place of others, or bytes changed."""
+        text = bvh(standing_poses(1, torch.Generator().manual_seed(0)).repeat(40, 1))
+        words = re.split(r"(\s+)", text)
+        odd = ("", "nan", "1e308", "-1", "0", "1e5", "1e-5", "}", "{", "JOINT", "MOTION", "9" * 5000, "999999", "6", "\ufeff")
+        for _ in range(draw.choice((0, 1, 1, 2, 8))):
+            words[draw.randrange(min(len(words), 400) if draw.random() < 0.7 else len(words))] = draw.choice(odd)
+        content = "".join(words).encode()
+        demonstrated(self._written("motion.bvh", flipped(content, draw) if draw.random() < 0.3 else content))
+
+    def _changed(self, folder: Path, name: str | Path, draw: random.Random) -> None:
+        """Read demonstrations by their name while a file of their folder is changed."""
+        path = draw.choice(sorted(one for one in folder.rglob("*") if one.is_file()))
+        content = path.read_bytes()
+        if path.suffix == ".json":
+            changed = as_json(json.loads(content), draw)
+        elif path.suffix == ".jsonl":
+            changed = b"\n".join(as_json(json.loads(row), draw) for row in content.splitlines())
+        else:
+            changed = _flipped_footer(content, draw)
+        path.write_bytes(changed)
+        try:
+            self._used(name)
+        finally:
+            path.write_bytes(content)
+
+    def _used(self, path: str | Path) -> None:
         found = Demonstrations.load(path).named("file")
         rows = torch.arange(len(found))
         found.windows(rows, torch.zeros_like(rows), 3)
@@ -419,7 +508,7 @@ def _outcome(run: Callable[[random.Random], None], draw: random.Random) -> tuple
         outcome, told = "UserError", str(error)
         if "\n" in told or len(told) > LONGEST + 100:
             outcome = "other"
-        if "alloc" in told or "MemoryError" in told:
+        if "allocate" in told or "MemoryError" in told:
             outcome = "memory"
     except MemoryError as error:
         outcome, told = "memory", repr(error)
@@ -475,7 +564,8 @@ def counts(kind: str, count: int, seed: int, limit: float) -> collections.Counte
 
 def main() -> None:
     """Print the counts of one kind of files, or of all."""
-    kinds = ("config.json", "concept", "safetensors", "npz", "lerobot", "csv", "checkpoint", "yaml")
+    demonstrations = ("safetensors", "npz", "lerobot", "lerobot v2.1", "minari", "bvh")
+    kinds = ("config.json", "concept", *demonstrations, "csv", "checkpoint", "yaml")
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kind", choices=("all", *kinds), default="all")
     parser.add_argument("--count", type=int, default=1000)

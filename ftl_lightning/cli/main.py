@@ -15,7 +15,7 @@ from omegaconf.errors import OmegaConfBaseException
 from ftl_lightning.cli import concepts, demonstrations, experiments, pages, sample
 from ftl_lightning.services import trust
 from ftl_lightning.services.command_line import TRAINER, Arguments, check_inputs, command_checks, one_line
-from ftl_lightning.services.errors import Note, UserError, mistake_of_machine, require
+from ftl_lightning.services.errors import LONGEST, Note, UserError, mistake_of_machine, require, short
 from ftl_lightning.services.text import any_terminal, line, say
 from ftl_lightning.version import __version__
 
@@ -163,7 +163,7 @@ def _notes() -> Iterator[None]:
 
 
 def _refused(message: str) -> int:
-    say("error:", line(message), error=True)
+    say("error:", short(line(message), LONGEST - len("error: ")), error=True)
     return 2
 
 

@@ -1,6 +1,6 @@
 """Record demonstrations by a wrapper of any Gymnasium environment. Needs ``gymnasium``, which every environment brings."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +14,32 @@ from ftl_lightning.data.formats.episodes import PART, Episode, Metadata, from_ep
 from ftl_lightning.services.errors import UserError, require, short
 
 Part = str | Callable[[Any], ArrayLike]
-"""Part of an observation: a key, or a function of the observation."""
+"""Part of an observation: a key, of a nested part such as ``'goal/achieved'``, or a function of the observation."""
+
+
+def parts_of(space: gymnasium.Space[Any]) -> dict[str, gymnasium.Space[Any]]:
+    """Parts of an observation that is a dictionary, by key; keys of nested parts are joined by ``/``."""
+    return dict(_leaves(space, "")) if isinstance(space, gymnasium.spaces.Dict) else {}
+
+
+def _leaves(space: gymnasium.Space[Any], key: str) -> Iterator[tuple[str, gymnasium.Space[Any]]]:
+    if isinstance(space, gymnasium.spaces.Dict | gymnasium.spaces.Tuple):
+        inner = space.spaces.items() if isinstance(space, gymnasium.spaces.Dict) else enumerate(space.spaces)
+        for name, part in inner:
+            yield from _leaves(part, f"{key}/{name}" if key else str(name))
+    else:
+        yield key, space
+
+
+def part_of(observation: Any, key: str) -> Any:
+    """Part of an observation by its key in :func:`parts_of`; the observation itself for the empty key."""
+    for name in key.split("/") if key else ():
+        observation = observation[int(name) if isinstance(observation, tuple) else name]
+    return observation
 
 
 def states_part(space: gymnasium.Space[Any], part: str = "") -> str:
-    """Key of the states in an observation; empty if the observation is itself a vector.
+    """Key of the states in an observation, see :func:`parts_of`; empty if the observation is itself a vector.
 
     Args:
         space: observation space.
@@ -28,8 +49,8 @@ def states_part(space: gymnasium.Space[Any], part: str = "") -> str:
         UserError: if the part is no vector or ambiguous.
     """
     if isinstance(space, gymnasium.spaces.Dict):
-        vectors = [key for key, box in space.spaces.items() if _is_vector(box)]
-        keys = ", ".join(vectors) or "none"
+        vectors = [key for key, box in parts_of(space).items() if _is_vector(box)]
+        keys = short(", ".join(vectors), 120) or "none"
         expected = f"observations with one vector or {PART!r}, or the key of the states, one of {keys}"
     else:
         vectors = [""] if _is_vector(space) else []
@@ -37,7 +58,7 @@ def states_part(space: gymnasium.Space[Any], part: str = "") -> str:
     if not part and (PART in vectors or len(vectors) == 1):
         return PART if PART in vectors else vectors[0]
     if not part or part not in vectors:
-        raise UserError(f"expected {expected}, found {repr(part) if part else type(space).__name__}")
+        raise UserError(f"expected {expected}, found {repr(short(part)) if part else type(space).__name__}")
     return part
 
 
@@ -55,11 +76,10 @@ def feature_parts(
     Raises:
         UserError: for a key without such a part.
     """
-    parts = space.spaces if isinstance(space, gymnasium.spaces.Dict) else {}
-    vectors = [key for key, box in parts.items() if _is_vector(box) or (images and isinstance(box, Box))]
+    known = [key for key, box in parts_of(space).items() if _is_vector(box) or (images and isinstance(box, Box))]
     for key in observed or ():
-        require(key in vectors, "observed", f"some of {', '.join(vectors) or 'none'}", f"{short(key)!r}")
-    return tuple(key for key in vectors if key != states) if observed is None else tuple(observed)
+        require(key in known, "observed", f"some of {short(', '.join(known), 120) or 'none'}", f"{short(key)!r}")
+    return tuple(key for key in known if key != states) if observed is None else tuple(observed)
 
 
 def _is_vector(space: gymnasium.Space[Any]) -> bool:
@@ -172,14 +192,13 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 def _part_of(observation: Any, part: Part) -> Any:
-    if callable(part):
-        return part(observation)
-    return observation[part] if part else observation
+    return part(observation) if callable(part) else part_of(observation, part)
 
 
 def _numbers(values: Any) -> NDArray[Any]:
     """Copy values, since environments may change them: to float32, or images with their channels first."""
     array = np.array(values)
     if array.dtype != np.uint8:
-        return np.atleast_1d(array.astype(np.float32))
+        with np.errstate(over="ignore"):  # overflow is reported later as a number that is not finite
+            return np.atleast_1d(array.astype(np.float32))
     return np.moveaxis(array, -1, 0) if array.ndim == 3 else array

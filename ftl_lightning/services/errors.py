@@ -6,14 +6,20 @@ from contextlib import contextmanager
 from pathlib import Path
 
 LONGEST = 300
-"""Maximum characters of an error message."""
+"""Maximum characters of a line on an error; paths may add 100."""
 
 
 class UserError(Exception):
     """Mistake in the input. The message is a single line: file or key, expected, found, what to do.
 
     The command line prints it without a traceback and exits with code 2.
+
+    Args:
+        message: shortened to :data:`LONGEST` + 100 characters in a single line, since files may hold texts of any length.
     """
+
+    def __init__(self, message: object = "") -> None:
+        super().__init__(short(str(message), LONGEST + 100))
 
 
 class Note(UserWarning):

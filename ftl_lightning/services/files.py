@@ -4,6 +4,7 @@ Size limits are far above legitimate files and far below a laptop's memory. An e
 raises them for files of tensors and their compressed content.
 """
 
+import codecs
 import os
 import re
 import stat
@@ -85,14 +86,14 @@ def check_unpacked(size: int, packed: int, what: str) -> None:
 
 
 def read_text(path: str | Path, kind: str, most: int = MOST_TEXT, encoding: str = "utf-8") -> str:
-    """Read a text file.
+    """Read a text file, without a byte order mark.
 
     Raises:
         UserError: naming the file, as :func:`check_readable`, or if it cannot be read or is in another encoding.
     """
     check_readable(path, kind, most)
     try:
-        return Path(path).read_text(encoding=encoding)
+        return Path(path).read_text(encoding=encoding).removeprefix(codecs.BOM_UTF8.decode(encoding))
     except UnicodeDecodeError as error:
         raise UserError(f"{path}: expected a {kind} file in {encoding}, found other bytes; save it as UTF-8") from error
     except OSError as error:

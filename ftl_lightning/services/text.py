@@ -37,9 +37,14 @@ def silence() -> None:
 
 
 def say(*parts: object, error: bool = False) -> None:
-    """Print values by :func:`plain` at once, separated by spaces, to standard output or standard error."""
+    """Print values by :func:`plain` at once, separated by spaces, to standard output or standard error.
+
+    Errors and notes are shortened to a line of twice :data:`~ftl_lightning.services.errors.LONGEST`.
+    """
     if not _silent:
-        print(*(plain(str(part)) for part in parts), file=sys.stderr if error else sys.stdout, flush=True)
+        text = " ".join(map(str, parts))
+        text = short(text, 2 * LONGEST) if error and len(text) > 2 * LONGEST else text
+        print(plain(text), file=sys.stderr if error else sys.stdout, flush=True)
 
 
 def any_terminal() -> None:
@@ -94,6 +99,7 @@ _MARKDOWN = re.compile(
     """,
     re.VERBOSE | re.IGNORECASE,
 )
+_BEGINNING = re.compile(r"^(\d*)([#+=.)-])")
 _ENTITIES = {"<": "&lt;", ">": "&gt;", "&": "&amp;"}
 _SCRIPT = str.maketrans({letter: f"\\u{ord(letter):04x}" for letter in "<>&\u2028\u2029"})
 MOST_DRAWN = 120
@@ -114,6 +120,11 @@ def latex_row(cells: list[str]) -> str:
 def markdown(text: str) -> str:
     """Escape a text for a cell or caption in GitHub's Markdown: no line break, HTML, link, picture, formula, code or new cell."""
     return _MARKDOWN.sub(lambda match: _ENTITIES.get(match[0], f"\\{match[0]}"), line(text))
+
+
+def markdown_item(text: str) -> str:
+    """:func:`markdown` for an item of a list, which begins no heading, line or list of its own."""
+    return _BEGINNING.sub(r"\1\\\2", markdown(text))
 
 
 def script_json(content: Any) -> str:

@@ -1,5 +1,6 @@
 """Check values against type annotations and ranges: options, arguments of the Python API, contents of files."""
 
+import codecs
 import collections
 import collections.abc
 import dataclasses
@@ -79,7 +80,7 @@ def read_json(path: Path, kind: str = "JSON") -> Any:
     """Read a JSON file; errors as :func:`parse_json` and :func:`~ftl_lightning.services.files.check_readable`."""
     check_readable(path, kind.removeprefix("a ").removesuffix(" file"), MOST_TEXT)
     with about(path):
-        return parse_json(path.read_bytes(), kind)
+        return parse_json(path.read_bytes().removeprefix(codecs.BOM_UTF8), kind)
 
 
 def parse_json(text: str | bytes, kind: str = "JSON") -> Any:

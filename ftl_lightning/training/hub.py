@@ -9,6 +9,7 @@ from ftl_lightning.igm.library import CONCEPT
 from ftl_lightning.services.errors import UserError, short, shown
 from ftl_lightning.services.shipped import FOLDERS
 from ftl_lightning.services.tensor_file import atomic
+from ftl_lightning.services.text import markdown, markdown_item
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.model_config import CONFIG
 from ftl_lightning.training.model_folder import save_model
@@ -69,13 +70,15 @@ def _reason(error: Exception) -> str:
 
 
 def card(model: ConceptModel) -> str:
-    """Model card with the Hub's metadata."""
-    texts = "\n".join(f"- {text}" for text in model.config.training_concepts)
+    """Model card with the Hub's metadata; names come from files, so they are escaped."""
+    config = model.config
+    texts = "\n".join(f"- {markdown_item(text)}" for text in config.training_concepts)
+    title = f"{markdown(model.method.name)} on {markdown(model.domain.name)}"
     return (
         "---\nlibrary_name: ftl-lightning\ntags: [few-shot-learning, diffusion, imitation-learning]\n---\n"
-        f"# {model.method.name} on {model.domain.name}\n\nHash {model.hash}; plans of {model.config.horizon} states of "
-        f"{model.config.state_dim} numbers. Text encoder: {model.config.encoder}.\n\nTraining concepts:\n\n{texts}\n\n"
-        f'    from ftl_lightning import FewShot\n    model = FewShot.from_pretrained("FOLDER OR NAME")\n\n'
+        f"# {title}\n\nHash {model.hash}; plans of {config.horizon} states of "
+        f"{config.state_dim} numbers. Text encoder: {markdown(config.encoder)}.\n\nTraining concepts:\n\n{texts}\n\n"
+        '```python\nfrom ftl_lightning import FewShot\nmodel = FewShot.from_pretrained("FOLDER OR NAME")\n```\n\n'
         f"Files: `{CONFIG}`, `model.safetensors` (weights in half precision).\n"
     )
 

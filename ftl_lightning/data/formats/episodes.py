@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ftl_lightning.data.columns import precise
 from ftl_lightning.data.demonstrations import Contents, Demonstrations, padded
 from ftl_lightning.services.errors import require, short
 from ftl_lightning.services.files import VARIABLE, most_bytes
@@ -22,13 +23,13 @@ class Episode:
     """A single demonstration.
 
     Attributes:
-        states: ``(time, state)`` float32.
+        states: ``(time, state)`` numbers.
         observed: features at each time, by name ``(time, *shape)``, float32, or uint8 for images.
         concept: text of the concept; empty if unknown.
         scene: ``(scene,)`` float32, which resets the environment to the initial state; ``None`` if there is none.
     """
 
-    states: NDArray[np.float32]
+    states: NDArray[Any]
     observed: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     concept: str = ""
     scene: NDArray[np.float32] | None = None
@@ -90,7 +91,8 @@ def from_episodes(episodes: Sequence[Episode], given: Metadata) -> Contents:
     size = longest * len(episodes) * sum(values[0].nbytes for values in (first.states, *first.observed.values()))
     message = f"{size}, {len(episodes)} episodes padded to {longest} steps; leave out the longest, or set {VARIABLE} to more"
     require(size <= (most := most_bytes()), "episodes", f"at most {most} bytes", message)
-    states, lengths = padded([_tensor(episode.states) for episode in episodes])
+    whole, lengths = padded([_tensor(episode.states) for episode in episodes])
+    states = torch.from_numpy(precise(whole.numpy()))
     columns = states.shape[2]
     per_step = tuple(name for name in (first.observed if given.per_step is None else given.per_step) if name in first.observed)
     scenes = [_tensor(episode.scene) for episode in episodes if episode.scene is not None]

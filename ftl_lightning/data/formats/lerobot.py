@@ -2,8 +2,9 @@
 
 A data set is a folder. ``meta/info.json`` describes the features of a frame, ``data/`` holds the frames of all episodes as Parquet
 files, and ``meta`` holds tasks and episodes. An episode is a demonstration. Its states are ``observation.state``, other vectors
-named ``observation.NAME`` are observed features that are known at every time, and the task text of its first frame is the concept.
-Actions, images and videos are not read.
+named ``observation.NAME`` are observed features that are known at every time, and the text of its task is the concept. Frames are
+sorted by ``frame_index``. An episode whose task changes is cut into a demonstration for each part with one task. Faults of
+``frame_index`` and ``timestamp`` are noted on standard error. Actions, images and videos are not read.
 
 The file ``meta/ftl_lightning.json``, ignored by other programs, holds what the format cannot: the domain, units of columns, names
 of features that are known only at the start, and provenance.
@@ -24,11 +25,12 @@ from numpy.typing import NDArray
 
 from ftl_lightning.data.demonstrations import FORMATS, Contents, Demonstrations, Format
 from ftl_lightning.data.formats.episodes import Episode, Metadata, check_names, from_episodes, measured, metadata, to_episodes
-from ftl_lightning.services.errors import UserError, about, require, short, shown
-from ftl_lightning.services.files import INFO, check_new_folder, read_text
+from ftl_lightning.data.formats.frames import Frames
+from ftl_lightning.services.errors import UserError, about, note, require, short, shown
+from ftl_lightning.services.files import INFO, check_new_folder
 from ftl_lightning.services.shipped import check_extra
-from ftl_lightning.services.text import line, say
-from ftl_lightning.services.validation import check_type, from_mapping, parse_json, read_json
+from ftl_lightning.services.text import line
+from ftl_lightning.services.validation import LARGEST, check_type, from_mapping, read_json
 
 VERSIONS = ("v2.0", "v2.1", "v3.0")
 """Versions that are read; the last is written."""
@@ -38,9 +40,10 @@ OBSERVED = "observation."
 """Prefix of observed features."""
 ACTION, SCENE = "action", "scene"
 EPISODE, TASK, LENGTH = "episode_index", "task_index", "length"
+FRAME, TIME = "frame_index", "timestamp"
 METADATA = Path("meta") / "ftl_lightning.json"
 """File of :class:`~ftl_lightning.data.formats.episodes.Metadata`, if this package has written the data set."""
-_ADDED = ("timestamp", "frame_index", EPISODE, "index", TASK)
+_ADDED = (TIME, FRAME, EPISODE, "index", TASK)
 """Features that LeRobot adds to every frame."""
 _DATA = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 _CHUNK, _MEGABYTES = 1000, 100
@@ -85,7 +88,7 @@ def _contents(folder: str | Path, part: str = "", observed: Sequence[str] | None
     from ftl_lightning.data.formats.parquet import read_columns
 
     root = Path(folder)
-    version, episodes, features = _info(root)
+    version, episodes, fps, features = _info(root)
     with about(root):
         part = _part(features, part)
         names = _observed(features, part, observed)
@@ -95,27 +98,35 @@ def _contents(folder: str | Path, part: str = "", observed: Sequence[str] | None
         with about(root / METADATA):
             metadata = from_mapping(Metadata, content, "")
     if part != STATE:  # names and units are those of the states that were written
-        metadata = replace(metadata, state_names=None, state_units=None)
+        metadata = replace(metadata, state_names=None, state_units=None, state_kinds=())
     metadata = replace(metadata, state_names=metadata.state_names or features[part].names)
     if images := short(", ".join(key for key, feature in features.items() if feature.dtype in ("image", "video")), 150):
-        say(line(f"{root}: left out {images}: images and videos are not read"), error=True)
-    scene = [SCENE] if written and SCENE in features else []
-    shapes = {key: features[key].shape for key in (part, *names, *scene)}
-    frames = read_columns(root, "data/*/*.parquet", {**shapes, EPISODE: (1,), TASK: (1,)}, (EPISODE, TASK))
-    order = np.argsort(frames[EPISODE], kind="stable")  # copied files may be in another order
-    frames = {key: values[order] for key, values in frames.items()}
+        note(line(f"{root}: left out {images}: images and videos are not read"))
     lengths, texts = _lengths_and_texts(root, version)
     require(episodes == len(lengths), f"{root / INFO}: key 'total_episodes'", f"{len(lengths)}, as in meta", str(episodes))
+    scene = [SCENE] if written and SCENE in features else []
+    shapes = {key: features[key].shape for key in (part, *names, *scene)}
+    numbers = dict.fromkeys((EPISODE, TASK, FRAME, TIME), (1,))
+    columns = read_columns(root, "data/*/*.parquet", shapes | numbers, (EPISODE, TASK, FRAME), (FRAME, TIME))
+    seconds = columns[TIME].reshape(-1).astype(np.float64) if TIME in columns else None
+    frames = Frames(columns[EPISODE], columns[TASK], columns.get(FRAME), seconds)
+    order = frames.order()
+    frames = frames.rows(order)
+    columns = {key: values[order] for key, values in columns.items()}
+    _check_counts(root, lengths, frames.episode)
+    for text in frames.notes(order, fps):
+        note(line(f"{root}: {text}"))
     read = []
-    for start, stop in _ranges(root, lengths, frames[EPISODE]):
-        task = int(frames[TASK][start])
+    for start, stop in frames.segments():
+        task = int(frames.task[start])
         require(task in texts, f"{root}: key {TASK!r}", "one of the tasks in meta", str(task))
+        whole = not start or frames.episode[start - 1] != frames.episode[start]
         read.append(
             Episode(
-                frames[part][start:stop].reshape(stop - start, -1).astype(np.float32),
-                {name.removeprefix(OBSERVED): measured(frames[name][start:stop]) for name in names},
+                columns[part][start:stop].reshape(stop - start, -1),
+                {name.removeprefix(OBSERVED): measured(columns[name][start:stop]) for name in names},
                 texts[task],
-                measured(frames[SCENE][start]) if scene else None,
+                measured(columns[SCENE][start]) if scene and whole else None,  # a scene is the episode's initial state
             )
         )
     with about(root):
@@ -123,8 +134,8 @@ def _contents(folder: str | Path, part: str = "", observed: Sequence[str] | None
     return {**contents, "provenance": contents["provenance"] or {"lerobot": root.resolve().name}}
 
 
-def _info(root: Path) -> tuple[str, int, dict[str, _Feature]]:
-    """Version, number of episodes, and features by name."""
+def _info(root: Path) -> tuple[str, int, float | None, dict[str, _Feature]]:
+    """Version, number of episodes, frames per second if stated, and features by name."""
     content = read_json(root / INFO, "a LeRobot info file")
     with about(root / INFO):
         content = check_type(content, Mapping[str, Any], "")
@@ -136,7 +147,9 @@ def _info(root: Path) -> tuple[str, int, dict[str, _Feature]]:
         require(inside, "key 'data_path'", "files in the folder 'data'", shown(data))
         features = check_type(content.get("features"), Mapping[str, Mapping[str, Any]], "features")
         episodes = check_type(content.get("total_episodes"), int, "total_episodes")
-        return version, episodes, {key: _feature(f"features.{short(key)}", fields) for key, fields in features.items()}
+        fps: float | None = check_type(content.get("fps"), float | None, "fps")
+        require(fps is None or fps > 0, "key 'fps'", "frames per second, more than 0", fps)
+        return version, episodes, fps, {key: _feature(f"features.{short(key)}", fields) for key, fields in features.items()}
 
 
 def _feature(key: str, fields: Mapping[str, Any]) -> _Feature:
@@ -175,38 +188,29 @@ def _observed(features: Mapping[str, _Feature], part: str, observed: Sequence[st
     return [OBSERVED + name for name in observed]
 
 
-def _ranges(root: Path, lengths: Mapping[int, int], index: NDArray[np.int64]) -> list[tuple[int, int]]:
-    """First frame and end of each episode, of sorted frames; their numbers must be those in meta."""
-    numbers, starts, counts = (part.tolist() for part in np.unique(index, return_index=True, return_counts=True))
-    actual = dict(zip(numbers, counts, strict=True))
+def _check_counts(root: Path, lengths: Mapping[int, int], index: NDArray[np.int64]) -> None:
+    """Refuse other numbers of frames than those in meta; ``index`` is the episode of each frame."""
+    numbers, counts = np.unique(index, return_counts=True)
+    actual = dict(zip(numbers.tolist(), counts.tolist(), strict=True))
     for number in {**lengths, **actual}:
         expected, count = lengths.get(number, 0), actual.get(number, 0)
         message = f"{count} in data; take another, whole copy"
         require(expected == count, f"{root}: episode {number}", f"{expected} frames, as in meta", message)
-    return [(start, start + count) for start, count in zip(starts, counts, strict=True)]
 
 
 def _lengths_and_texts(root: Path, version: str) -> tuple[dict[int, int], dict[int, str]]:
     """Lengths of episodes and texts of tasks, by number."""
+    from ftl_lightning.data.formats.parquet import read_columns, read_lines, read_texts
+
+    meta = root / "meta"
     if not version.startswith("v3"):
-        lengths = _by_number(root / "meta" / "episodes.jsonl", EPISODE, LENGTH, int)
-        return lengths, _by_number(root / "meta" / "tasks.jsonl", TASK, "task", str)
-    from ftl_lightning.data.formats.parquet import read_columns, read_texts
-
-    columns = read_columns(root, "meta/episodes/*/*.parquet", {EPISODE: (1,), LENGTH: (1,)}, (EPISODE, LENGTH))
+        episodes = read_lines(meta / "episodes.jsonl", {EPISODE: "int64", LENGTH: "int64"})
+        tasks = read_lines(meta / "tasks.jsonl", {TASK: "int64", "task": "string"})
+        lengths, texts = (dict(zip(*rows.values(), strict=True)) for rows in (episodes, tasks))
+        return lengths, {number: text for number, text in texts.items() if text is not None}
+    columns = read_columns(root, "meta/episodes/*/*.parquet", {EPISODE: (1,), LENGTH: (1,)}, (EPISODE, LENGTH), rows=LARGEST)
     lengths = dict(zip(columns[EPISODE].tolist(), columns[LENGTH].tolist(), strict=True))
-    return lengths, read_texts(root / "meta" / "tasks.parquet", TASK, "task")
-
-
-def _by_number(path: Path, number: str, value: str, kind: type) -> dict[int, Any]:
-    """Values by number, from a file with a JSON object in each line."""
-    values = {}
-    for index, text in enumerate(read_text(path, "LeRobot").splitlines()):
-        if text.strip():
-            with about(path):
-                row = check_type(parse_json(text), Mapping[str, Any], f"line {index + 1}")
-                values[check_type(row.get(number), int, number)] = check_type(row.get(value), kind, value)
-    return values
+    return lengths, read_texts(meta / "tasks.parquet", TASK, "task")
 
 
 def write_lerobot(demonstrations: Demonstrations, folder: str | Path, fps: int = 10) -> None:
@@ -272,8 +276,8 @@ def _columns(episode: Episode, number: int, task: int, first: int, fps: int) -> 
         ACTION: np.concatenate((episode.states[1:], episode.states[-1:])),
         **{OBSERVED + name: values for name, values in episode.observed.items()},
         **({} if episode.scene is None else {SCENE: np.repeat(episode.scene[None], time, axis=0)}),
-        "timestamp": (steps / fps).astype(np.float32),
-        "frame_index": steps,
+        TIME: (steps / fps).astype(np.float32),
+        FRAME: steps,
         EPISODE: np.full((time, 1), number),
         "index": first + steps,
         TASK: np.full((time, 1), task),

@@ -1,30 +1,44 @@
 """Minari data sets. Needs the extra ``minari``.
 
-An episode is a demonstration. Its states are the flattened observations. If an observation is a dictionary, a part holds the
-states, and its other vectors are observed features that are known at every time. A demonstration's text is the first ``concept`` in
-the episode's ``infos`` (of its first step, if they are per step), the episode's metadata, or the data set's metadata; by
+An episode is a demonstration. Its states are the flattened observations. If an observation is a dictionary, one part holds the
+states, and its other vectors are observed features that are known at every time; keys of nested parts are joined by ``/``. Parts
+that are not read are noted on standard error. A demonstration's text is the first ``concept`` in
+the episode's ``infos`` (of its first step, if there is one for each step), the episode's metadata, or the data set's metadata; by
 default, the data set's name.
 
 Metadata of the data set hold what Minari cannot: the domain, names and units of columns, names of features that are known only at
 the start, and provenance. Scenes are ``scene`` in an episode's ``infos``.
 """
 
+import json
 import warnings
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
+from math import prod
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ftl_lightning.data.demonstrations import FORMATS, Contents, Demonstrations, Format
 from ftl_lightning.data.formats.episodes import PART, Episode, Metadata, check_names, from_episodes, measured, metadata, to_episodes
-from ftl_lightning.services.errors import UserError, about, require, short
+from ftl_lightning.services.errors import UserError, about, note, require, short, shown
+from ftl_lightning.services.files import check_readable, check_unpacked, read_text
 from ftl_lightning.services.shipped import check_extra
-from ftl_lightning.services.validation import from_mapping
+from ftl_lightning.services.text import line
+from ftl_lightning.services.validation import LARGEST, check_type, from_mapping
 
 CONCEPT, SCENE = "concept", "scene"
 """Keys of an episode's text and scene, see this module."""
 _HEADER = "ftl_lightning"  # metadata key of attributes that only write_minari knows
+_DAMAGED = (
+    *(ImportError, OSError, ValueError, KeyError, TypeError, AttributeError, AssertionError, NotImplementedError),
+    *(IndexError, RuntimeError, OverflowError),
+)
+"""Exceptions of Minari, Gymnasium and h5py for damaged or foreign data sets."""
 
 
 def read_minari(name: str, part: str = "", observed: Sequence[str] | None = None) -> Demonstrations:
@@ -32,7 +46,8 @@ def read_minari(name: str, part: str = "", observed: Sequence[str] | None = None
 
     Args:
         name: name such as ``strokes/test-v0``. Minari looks in ``MINARI_DATASETS_PATH``, by default ``~/.minari/datasets``.
-        part: key of the states in dictionaries; empty for ``'observation'`` or the only vector.
+        part: key of the states in dictionaries, such as ``'goal/achieved'`` of a nested part; empty for ``'observation'`` or the
+            only vector.
         observed: keys of observed features; ``None`` for all other vectors. Images are read only from data sets of
             :func:`write_minari`.
 
@@ -49,11 +64,19 @@ def read_minari(name: str, part: str = "", observed: Sequence[str] | None = None
 def _contents(name: str, part: str = "", observed: Sequence[str] | None = None) -> Contents:
     check_extra("minari", f"{name}: expected a file, found none; a Minari data set of this name")
     import minari
+    from minari.storage.datasets_root_dir import get_dataset_path
 
-    from ftl_lightning.data.recording import feature_parts, states_part
+    from ftl_lightning.data.recording import feature_parts, parts_of, states_part
 
     try:
-        dataset = minari.load_dataset(name)
+        folder = Path(get_dataset_path(name)) / "data"
+        if not folder.exists():
+            message = "expected a file or an installed Minari data set, found neither; see: minari list local"
+            raise UserError(f"{name}: {message}")
+        with about(name):
+            _check_metadata(folder)
+        with warnings.catch_warnings(action="ignore"):  # advice of Gymnasium about limits and precision
+            dataset = minari.load_dataset(name)
         attributes = dataset.storage.metadata
         written = _HEADER in attributes
         with about(name):
@@ -61,14 +84,16 @@ def _contents(name: str, part: str = "", observed: Sequence[str] | None = None) 
             part = states_part(dataset.observation_space, part)
             features = feature_parts(dataset.observation_space, part, observed, images=written)
         if part not in ("", PART):  # names and units are those of the states that were written
-            metadata = replace(metadata, state_names=None, state_units=None)
-        texts = [_text(entry) for entry in dataset.storage.get_episode_metadata(dataset.episode_indices)]
-        texts = [text or _text(attributes) or name for text in texts]
-        episodes = [_episode(episode, part, features, text, written) for episode, text in zip(dataset, texts, strict=True)]
-    except FileNotFoundError as error:
-        message = "expected a file or an installed Minari data set, found neither; see: minari list local"
-        raise UserError(f"{name}: {message}") from error
-    except (ImportError, OSError, ValueError, KeyError, TypeError, AttributeError, AssertionError) as error:
+            metadata = replace(metadata, state_names=None, state_units=None, state_kinds=())
+        parts = {"": dataset.observation_space} | parts_of(dataset.observation_space)
+        left = [key for key in parts if key not in ("", part, *features)]
+        if observed is None and left:
+            note(line(f"{name}: left out {short(', '.join(left), 150)}: only vectors are read"))
+        text = _text(attributes) or name
+        spaces = {key: parts[key] for key in (part, *features)}
+        with about(name), _raw(dataset, folder) as raw:
+            episodes = [_episode(number, episode, spaces, text, written) for number, episode in enumerate(raw)]
+    except _DAMAGED as error:
         message = short(str(error), 100)
         raise UserError(f"{name}: expected a Minari data set, found a damaged or foreign one ({message})") from error
     with about(name):
@@ -76,15 +101,110 @@ def _contents(name: str, part: str = "", observed: Sequence[str] | None = None) 
     return {**contents, "provenance": contents["provenance"] or {"minari": name}}
 
 
-def _episode(episode: Any, part: str, features: Sequence[str], text: str, written: bool) -> Episode:
-    observations, infos = episode.observations, episode.infos or {}
-    states = np.asarray(observations[part] if part else observations, dtype=np.float32)
+def _check_metadata(folder: Path) -> None:
+    """Refuse metadata that let Minari run code, or that ask for more memory than the data can fill."""
+    path = folder / "metadata.json"
+    content = check_type(json.loads(read_text(path, "Minari")), Mapping[str, Any], "")
+    episodes = check_type(content.get("total_episodes"), int, "total_episodes")
+    for key in ("observation_space", "action_space"):  # without them, Minari makes the environment that the file names
+        _check_space(json.loads(check_type(content.get(key), str, key)), key)
+    if check_type(content.get("data_format"), Literal["hdf5", "arrow", "parquet"], "data_format") == "hdf5":
+        return
+    numbers = {path.name for path in folder.iterdir()}
+    require(all(str(number) in numbers for number in range(episodes)), "total_episodes", "a folder for each", str(episodes))
+
+
+def _check_space(space: Any, key: str) -> None:
+    """Refuse a space of many numbers, whose limits Minari makes."""
+    space = check_type(space, Mapping[str, Any], key)
+    shape: tuple[int, ...] = check_type(space.get("shape", []), tuple[int, ...], f"{key}.shape")
+    require(prod(shape) <= LARGEST, f"key '{key}.shape'", f"at most {LARGEST} numbers", shown(shape))
+    inner = space.get("subspaces", [])
+    for part in inner.values() if isinstance(inner, Mapping) else inner:
+        _check_space(part, key)
+
+
+@dataclass(frozen=True)
+class _Raw:
+    """Episode as it is stored: a reader of a part of its observations by key, its infos and its metadata."""
+
+    part: Callable[[str], Any]
+    infos: Mapping[str, Any]
+    metadata: Mapping[str, Any]
+
+
+@contextmanager
+def _raw(dataset: Any, folder: Path) -> Iterator[Iterator[_Raw]]:
+    """Episodes of a data set; of HDF5 files only what is needed is read, and no code of Minari reads them."""
+    from ftl_lightning.data.recording import part_of
+
+    if dataset.storage.FORMAT != "hdf5":
+        _check_tables(dataset, folder)
+        rows = zip(dataset, dataset.storage.get_episode_metadata(dataset.episode_indices), strict=True)
+        yield (_Raw(partial(part_of, episode.observations), episode.infos or {}, metadata) for episode, metadata in rows)
+        return
+    from ftl_lightning.data.formats.hdf5_file import opened
+
+    with opened(folder / "main_data.hdf5") as file:
+        count = sum(key.startswith("episode_") for key in file)
+        require(dataset.total_episodes == count, "key 'total_episodes'", f"{count}, as in the file", dataset.total_episodes)
+
+        def read(number: int) -> _Raw:
+            group = file[f"episode_{number}"]
+            infos = {key: _array(group, f"infos/{key}") for key in (CONCEPT, SCENE)}
+            first = {key: found[:1] if found.shape else found[()] for key, found in infos.items() if found is not None}
+            return _Raw(lambda key: _array(group["observations"], key), first, {CONCEPT: group.attrs.get(CONCEPT, "")})
+
+        yield map(read, range(count))
+
+
+def _array(node: Any, key: str) -> Any:
+    """Array of an HDF5 file by its key below a group; ``None`` if it is missing, a group or empty."""
+    for name in key.split("/") if key else ():
+        node = None if not hasattr(node, "keys") else node.get(name, node.get(f"_index_{name}"))  # the latter is a Tuple's
+    return None if node is None or getattr(node, "shape", None) is None else node
+
+
+def _check_tables(dataset: Any, folder: Path) -> None:
+    """Refuse Arrow and Parquet files that are much larger when unpacked, by the rows and the spaces."""
+    import pyarrow.dataset
+
+    from ftl_lightning.data.recording import parts_of
+
+    kind, skipped = dataset.storage.FORMAT, ["_", ".", "metadata.json"]
+    folders = [folder / str(number) for number in dataset.episode_indices]
+    tables = (pyarrow.dataset.dataset(str(path), format=kind, ignore_prefixes=skipped) for path in folders)
+    spaces = (parts_of(space) or {"": space} for space in (dataset.observation_space, dataset.action_space))
+    width = sum(8 * prod(part.shape or ()) for parts in spaces for part in parts.values())
+    packed = sum(check_readable(path, "Minari") for part in folders for path in part.iterdir())
+    check_unpacked(sum(table.count_rows() for table in tables) * width, packed, "episodes")
+
+
+def _episode(number: int, episode: _Raw, spaces: Mapping[str, Any], text: str, written: bool) -> Episode:
+    """Convert an episode; ``spaces`` are those of the states, which are the first, and of the features."""
+    parts = {key: _numbers(f"episode {number}: {key or 'observations'}", episode.part(key), space) for key, space in spaces.items()}
+    (part, states), *features = parts.items()
+    for key, values in features:
+        expected = f"{len(states)} steps, as of {part!r}"
+        require(len(values) == len(states), f"episode {number}: {key}", expected, str(len(values)))
     return Episode(
         states.reshape(len(states), -1),
-        {key: measured(observations[key]) for key in features},
-        _text(infos) or text,
-        np.asarray(infos[SCENE], dtype=np.float32)[0] if written and SCENE in infos else None,
+        {key: measured(values) for key, values in features},
+        _text(episode.infos) or _text(episode.metadata) or text,
+        measured(episode.infos[SCENE])[0] if written and SCENE in episode.infos else None,
     )
+
+
+def _numbers(place: str, values: Any, space: Any) -> NDArray[Any]:
+    """Read numbers ``(step, *shape)`` of a part, float32, or uint8 for images, whose space has the shape of a step."""
+    shape: tuple[int, ...] = getattr(values, "shape", ())
+    kind = getattr(getattr(values, "dtype", None), "kind", "O")
+    require(kind in "fiub", place, "numbers", "nothing" if values is None else "others")
+    require(len(shape) and shape[1:] == space.shape, place, f"steps of shape {space.shape}, as in metadata", str(shape[1:]))
+    require(shape[0], place, "at least one step", "none")
+    array: NDArray[Any] = np.asarray(values[()])
+    kept = np.uint8 if space.dtype == np.uint8 else np.float64
+    return array if array.dtype == kept else array.astype(np.float32)
 
 
 def _text(attributes: Mapping[str, Any] | None) -> str:
@@ -142,7 +262,7 @@ def write_minari(demonstrations: Demonstrations, name: str) -> None:
     try:
         with warnings.catch_warnings(action="ignore"):  # advice about author, permalink and so on
             written = minari.create_dataset_from_buffers(
-                name, buffers, observation_space=space, action_space=Box(0, 0, (1,), np.float32)
+                name, buffers, observation_space=space, action_space=Box(0, 0, (1,), np.float32), jpeg_encoding=False
             )
             written.storage.update_metadata({_HEADER: metadata(demonstrations)})
     except (ImportError, OSError, ValueError, AttributeError, TypeError) as error:

@@ -1,15 +1,17 @@
 """Numbers and texts in Parquet files. Needs ``pyarrow``: import this module only after the check of the extra."""
 
+import codecs
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from math import prod
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.compute as pc
+import pyarrow.json as pj
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
@@ -19,10 +21,19 @@ from ftl_lightning.services.tensor_file import visible
 
 _DAMAGED = (pa.ArrowException, OSError, ValueError, TypeError, KeyError, IndexError, OverflowError, MemoryError)
 """Exceptions of pyarrow for damaged or foreign files."""
+MOST_TASKS = 100_000
+"""Maximum number of texts of tasks."""
+MOST_TASK_BYTES = 8 * 2**20
+"""Maximum bytes of all texts of tasks."""
 
 
 def read_columns(
-    root: Path, pattern: str, shapes: Mapping[str, tuple[int, ...]], whole: Collection[str]
+    root: Path,
+    pattern: str,
+    shapes: Mapping[str, tuple[int, ...]],
+    whole: Collection[str],
+    optional: Collection[str] = (),
+    rows: int | None = None,
 ) -> dict[str, NDArray[Any]]:
     """Read and concatenate columns of the files below ``root`` that match a pattern.
 
@@ -30,19 +41,25 @@ def read_columns(
         root, pattern: folder, and pattern of its files.
         shapes: shape of a row of each column, by name; a shape of a single number may be stored without a list.
         whole: names of columns of whole numbers (int64).
+        optional: names of columns that are left out if the first file lacks them.
+        rows: maximum number of rows of all files; ``None`` for the limit of memory.
 
     Returns:
         Numbers by name, ``(row, *shape)``, or ``(row,)`` if whole; missing numbers are NaN.
 
     Raises:
-        UserError: naming the file, if it is missing, damaged, unpacks to far more than its size, or has other columns.
+        UserError: naming the file, if it is missing, damaged, much larger than its bytes, or has other columns or rows.
     """
     paths = visible(root, pattern)
     require(1 <= len(paths) <= MOST_TENSORS, str(root), f"Parquet files {pattern}, at most {MOST_TENSORS}", str(len(paths)))
-    packed, size = sum(check_readable(path, "Parquet") for path in paths), 0
+    packed, size, actual = sum(check_readable(path, "Parquet") for path in paths), 0, 0
     for path in paths:
         with _opened(path) as file:
+            if path == paths[0]:
+                shapes = {name: shape for name, shape in shapes.items() if name not in {*optional} - {*file.schema_arrow.names}}
             size += _checked_size(path, file, shapes)
+            actual += file.metadata.num_rows
+    require(rows is None or actual <= rows, str(root / pattern), f"at most {rows} rows", str(actual))
     with about(root):
         check_unpacked(size, packed, "frames")
     parts: dict[str, list[NDArray[Any]]] = {name: [] for name in shapes}
@@ -60,16 +77,46 @@ def read_texts(path: Path, number: str, name: str) -> dict[int, str]:
     Raises:
         UserError: naming the file, if it is missing, damaged, too large, or lacks the columns.
     """
-    check_readable(path, "tasks", MOST_TEXT)
+    packed = check_readable(path, "tasks", MOST_TASK_BYTES)
     with _opened(path) as file:
         size = sum(file.metadata.row_group(group).total_byte_size for group in range(file.num_row_groups))
-        require(max(size, file.metadata.num_rows) <= MOST_TEXT, str(path), f"texts of at most {MOST_TEXT} bytes", str(size))
+        expected = f"texts of at most {MOST_TASK_BYTES} bytes"
+        require(size <= MOST_TASK_BYTES, str(path), expected, str(size))
+        require(file.metadata.num_rows <= MOST_TASKS, str(path), f"at most {MOST_TASKS} tasks", str(file.metadata.num_rows))
         schema = file.schema_arrow
         texts = [field.name for field in schema if pa.types.is_string(field.type) or pa.types.is_large_string(field.type)]
-        has_texts = number in schema.names and texts and pa.types.is_integer(schema.field(number).type)
-        require(has_texts, str(path), f"the columns {number!r} and {name!r}", short(", ".join(schema.names)))
-        table = file.read(columns=[number, name if name in texts else texts[0]])
-        return {key: text for key, text in zip(*(column.to_pylist() for column in table.columns), strict=True) if text is not None}
+        known = number in schema.names and texts and pa.types.is_integer(schema.field(number).type)
+        require(known, str(path), f"the columns {number!r} and {name!r}", short(", ".join(schema.names)))
+        columns, decoded = [number, name if name in texts else texts[0]], 0
+        named: dict[int, str] = {}
+        # A text that is stored once stands for many rows. No row is larger than all that is stored, so batches stay small.
+        for batch in file.iter_batches(max(1, MOST_TASK_BYTES // max(size, packed)), columns=columns):
+            decoded += batch.nbytes
+            require(
+                decoded <= MOST_TASK_BYTES, str(path), f"texts of at most {MOST_TASK_BYTES} bytes", "more when they are decoded"
+            )
+            keys, values = (batch.column(column).to_pylist() for column in columns)
+            named |= {key: text for key, text in zip(keys, values, strict=True) if text is not None}
+        return named
+
+
+def read_lines(path: Path, kinds: Mapping[str, Literal["int64", "string"]]) -> dict[str, list[Any]]:
+    """Read values by name from a file with a JSON object in each line; other names are ignored, missing values are ``None``.
+
+    Raises:
+        UserError: naming the file, if it is missing, damaged, too large, or holds values of another type.
+    """
+    check_readable(path, "LeRobot", MOST_TEXT)
+    content = path.read_bytes().removeprefix(codecs.BOM_UTF8)
+    schema = pa.schema([pa.field(name, pa.type_for_alias(kind)) for name, kind in kinds.items()])
+    parsing = pj.ParseOptions(explicit_schema=schema, unexpected_field_behavior="ignore")
+    reading = pj.ReadOptions(use_threads=False, block_size=len(content) + 1)  # a line may be as long as the file
+    try:
+        table = pj.read_json(pa.BufferReader(content), reading, parsing) if content.strip() else schema.empty_table()
+        return {name: table.column(name).to_pylist() for name in kinds}
+    except _DAMAGED as error:
+        expected = "a JSON object with " + " and ".join(f"{name!r} ({kind})" for name, kind in kinds.items())
+        raise UserError(f"{path}: expected {expected} in each line, found others ({short(str(error), 100)})") from error
 
 
 def write_rows(path: Path, rows: list[dict[str, Any]]) -> None:
@@ -130,15 +177,29 @@ def _checked_size(path: Path, file: pq.ParquetFile, shapes: Mapping[str, tuple[i
             count, expected = rows.column(leaves[0]).num_values, rows.num_rows * max(1, prod(shape))
             message = f"{rows.num_rows} times {prod(shape)} numbers, as info.json says"
             require(count == expected, f"{path}: column {name!r}", message, str(count))
-        kind = file.schema_arrow.field(name).type
-        while _is_list(kind):
-            kind = kind.value_type
+        kind = _innermost(file.schema_arrow.field(name).type)
+        require(_is_number(kind), f"{path}: column {name!r}", f"numbers of shape {shape}", short(str(kind)))  # a text has any size
         size += file.metadata.num_rows * prod(shape) * (1 if pa.types.is_uint8(kind) else 8)
     return size
 
 
 def _is_list(kind: pa.DataType) -> bool:
     return pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)
+
+
+def _innermost(kind: pa.DataType) -> pa.DataType:
+    """Type of the items of lists, however nested."""
+    while True:
+        if isinstance(kind, pa.BaseExtensionType):
+            kind = kind.storage_type
+        elif _is_list(kind):
+            kind = kind.value_type
+        else:
+            return kind
+
+
+def _is_number(kind: pa.DataType) -> bool:
+    return pa.types.is_floating(kind) or pa.types.is_integer(kind) or pa.types.is_boolean(kind)
 
 
 def _numbers(place: str, column: pa.ChunkedArray, shape: tuple[int, ...], whole: bool) -> NDArray[Any]:
@@ -153,8 +214,7 @@ def _numbers(place: str, column: pa.ChunkedArray, shape: tuple[int, ...], whole:
         require(even, place, f"{size} numbers in each list", "other lists")
         values = values.flatten()
     kind = values.type
-    numeric = pa.types.is_floating(kind) or pa.types.is_integer(kind) or pa.types.is_boolean(kind)
-    fits = numeric and len(values) == len(column) * prod(shape)
+    fits = _is_number(kind) and len(values) == len(column) * prod(shape)
     require(fits, place, f"numbers of shape {shape}", short(str(column.type)))
     if whole:
         valid = pa.types.is_integer(kind) and not values.null_count

@@ -15,6 +15,9 @@ from scipy.spatial.transform import Rotation
 from ftl_lightning.services.errors import UserError, require
 from ftl_lightning.services.files import most_bytes, read_text
 
+LARGEST = 1e6
+"""Maximum magnitude of a number in a file: a length, or an angle in degrees."""
+
 INCH = 0.0254  # Metres. Lengths in the database are inches after division by length in the skeleton's units.
 ROOT = "root"
 JOINT_BONES = (
@@ -217,5 +220,5 @@ class _Lines:
         except ValueError:
             values = []
         expected = "a finite number" if count == 1 else f"{count} finite numbers"
-        self.check(len(values) == count and all(map(math.isfinite, values)), expected, words)
+        self.check(len(values) == count and all(abs(value) <= LARGEST for value in values), expected, words)
         return values

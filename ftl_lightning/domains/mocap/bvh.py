@@ -1,5 +1,7 @@
 """BVH files, read and written: a position of a joint per frame replaces its offset, as in Blender."""
 
+import itertools
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,12 +13,18 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ftl_lightning.domains.mocap import skeleton
-from ftl_lightning.domains.mocap.asf_amc import INCH, THORAX, Skeleton
+from ftl_lightning.domains.mocap.asf_amc import INCH, LARGEST, THORAX, Skeleton
 from ftl_lightning.domains.mocap.skeleton import FPS, as_joints, standing_poses
 from ftl_lightning.services.errors import UserError, require, short
 from ftl_lightning.services.files import read_text
 
 Numbers = NDArray[np.float64]
+FASTEST, SLOWEST = 1e-4, 1.0
+"""Range of seconds between frames."""
+MOST_NODES = 1000
+"""Maximum number of joints and end sites; a hand with all its fingers has 20."""
+MOST_PLACES = 2_500_000
+"""Maximum number of positions, frames times nodes: 240 MB of rotations."""
 END = "EndSite"  # Prefix of the name of an end site, before its joint's name
 _POSITIONS = {f"{axis}position": number for number, axis in enumerate("XYZ")}
 _ROTATIONS = {f"{axis}rotation": number for number, axis in enumerate("XYZ")}
@@ -81,25 +89,34 @@ def _turned(axis: int, angles: Numbers) -> Numbers:
 
 
 def read_motion(path: Path) -> Motion:
-    """Read a motion; raise a ``UserError`` with the path for a damaged file."""
+    """Read a motion; raise a ``UserError`` with the path for a file that is damaged or larger than any motion."""
     text = read_text(path, "BVH")
     try:
         hierarchy, mark, rest = text.partition("MOTION")
         _check(mark, "no line MOTION")
-        nodes = tuple(_nodes(iter(hierarchy.split())))
+        nodes = tuple(_nodes(word[0] for word in re.finditer(r"\S+", hierarchy)))
         words = rest.split(maxsplit=5)
         keys = [word.lower() for word in (*words[:1], *words[2:4])]
         _check(len(words) > 4 and keys == ["frames:", "frame", "time:"], "no lines 'Frames: N' and 'Frame Time: S' after MOTION")
         count, seconds = int(words[1]), float(words[4])
-        values = np.array(words[5].split() if len(words) > 5 else [], dtype=np.float64)
+        place, expected = f"{path}: Frame Time", f"seconds between frames, {FASTEST:g} to {SLOWEST:g}"
+        require(FASTEST <= seconds <= SLOWEST, place, expected, short(words[4]))
+        place, expected = f"{path}: Frames", f"1 to {MOST_PLACES // len(nodes)} frames of {len(nodes)} joints and end sites"
+        require(1 <= count <= MOST_PLACES // len(nodes), place, expected, short(words[1]))
         channels = sum(len(node.channels) for node in nodes)
-        _check(count >= 1 and 0 < seconds < np.inf, f"{count} frames of {seconds:g} s")
+        values = _numbers(words[5] if len(words) > 5 else "", count * channels)
         _check(len(values) == count * channels, f"{len(values)} numbers for {count} frames of {channels}")
-        finite = np.isfinite(values).all() and all(np.isfinite(node.offset).all() for node in nodes)
-        _check(finite, "numbers that are not finite")
+        within = (np.abs(part) <= LARGEST for part in (values, *(node.offset for node in nodes)))
+        _check(all(part.all() for part in within), f"numbers that are not finite, or beyond {LARGEST:g}")
     except ValueError as error:
         raise UserError(f"{path}: expected a BVH file, found a damaged one ({short(str(error), 100)})") from error
     return Motion(nodes, values.reshape(count, channels), seconds)
+
+
+def _numbers(text: str, most: int) -> Numbers:
+    """Numbers of a text, at most one more than ``most``; a ``ValueError`` for other words. A list of all words takes gigabytes."""
+    words = (float(word[0]) for word in re.finditer(r"\S+", text))
+    return np.fromiter(itertools.islice(words, most + 1), dtype=np.float64)
 
 
 def _check(condition: object, damage: str) -> None:
@@ -113,6 +130,7 @@ def _nodes(words: Iterator[str]) -> Iterable[Node]:
     nodes: list[Node] = []
     path: list[int] = []  # from the root to the open node
     for word in words:
+        _check(len(nodes) <= MOST_NODES, f"more than {MOST_NODES} joints")
         if word == "}" and path:
             path.pop()
             continue

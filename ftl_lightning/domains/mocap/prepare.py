@@ -38,6 +38,7 @@ FLOOR = 0.05  # Metres: initial frames with lower hips have no root yet
 _TRIAL = re.compile(r"(\d{2,3}_\d{2,3})(?!\d)")
 EXAMPLES = 3  # Maximum examples printed per reason; the report has all
 SAME_RATE = 0.01  # Relative difference of frame rates that is rounding
+MOST_FRAMES = 100_000  # Maximum frames of a motion at FPS, almost an hour
 _skeleton = functools.cache(read_asf)
 
 
@@ -226,7 +227,7 @@ def _index(root: Path) -> dict[str, str]:
         hint = "it comes with B. Hahne's conversion of the database (cgspeed.com)"
         raise UserError(f"{root}: expected the index of descriptions, {INDEXES[0]} or {INDEXES[1]}, found neither; {hint}")
     check_readable(path, "text", MOST_TEXT)
-    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
     rows = csv.reader(lines) if path.suffix == ".csv" else (line.split("\t") for line in lines)
     descriptions = {row[0].strip(): cleaned(row[1]) for row in rows if len(row) > 1 and _TRIAL.fullmatch(row[0].strip())}
     require(descriptions, str(path), "lines such as '13_29,description'", "none")
@@ -246,6 +247,9 @@ def demonstrated(path: Path) -> Demonstrations:
         for name in EXPORTED:
             require(name in motion.names, str(path), expected, f"a skeleton without {name!r}")
         joints = motion.places(EXPORTED)
+    frames = len(joints) * motion.seconds * FPS
+    expected = f"motion of at most {MOST_FRAMES} frames at {FPS} a second"
+    require(frames <= MOST_FRAMES, str(path), expected, f"{frames:.0f}: {len(joints)} of {motion.seconds:g} s")
     states = normalised(z_up(_at_rate(joints, motion.seconds))).states
     parts = pieces(states)
     expected = f"a motion of {HORIZON} frames or more at {FPS} a second, without jumps"
