@@ -174,7 +174,7 @@ def test_a_large_question_holds_up_no_other(scenes: Served, kind: str) -> None:
             waits.append(timed(scenes))
         status, content, _ = asked.result()
     assert status == 400, content
-    assert max(waits) < 2, waits  # half a second where the page is in a process of its own
+    assert max(waits) < 3, waits  # half a second where the page has a process to itself
     assert len(content) < 400
     assert b"expected" in content
 
