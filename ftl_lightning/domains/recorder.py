@@ -87,7 +87,9 @@ def check_path(scene: Scene, path: Any, seconds: Any) -> tuple[Numbers, Numbers]
             go back.
     """
     pieces = max(len(scene.pieces), 1)
-    _check_sizes(path, seconds, pieces)
+    for key, values in (("path", path), ("seconds", seconds)):  # sizes before contents
+        count = len(values) if isinstance(values, Sized) else 0
+        require(count <= MOST_STEPS, key, f"at most {MOST_STEPS:,} steps", f"{count:,}; show it more quickly")
     places, times = _numbers("path", path), _numbers("seconds", seconds)
     fits = places.ndim == 3 and places.shape[1:] == (pieces, 2) and len(places)
     require(fits, "path", f"places of shape (step, {pieces}, 2)", str(places.shape))
@@ -100,16 +102,6 @@ def check_path(scene: Scene, path: Any, seconds: Any) -> tuple[Numbers, Numbers]
     found = f"one {away:.3g} times its size from its middle"
     require(away <= 0.5 + AROUND, "path", "places near what is in sight", found)
     return places, times
-
-
-def _check_sizes(path: Any, seconds: Any, pieces: int) -> None:
-    """Refuse long or wide lists before their contents are read."""
-    for key, values in (("path", path), ("seconds", seconds)):
-        count = len(values) if isinstance(values, Sized) else 0
-        require(count <= MOST_STEPS, key, f"at most {MOST_STEPS:,} steps", f"{count:,}; show it more quickly")
-    for index, step in enumerate(path if isinstance(path, list) else ()):
-        fits = isinstance(step, list) and len(step) == pieces and all(isinstance(at, list) and len(at) == 2 for at in step)
-        require(fits, f"path[{index}]", f"{pieces} places of two numbers", "other lists")
 
 
 def _numbers(key: str, values: Any) -> Numbers:
