@@ -1,6 +1,6 @@
 """Recording of demonstrations with a pointer: scenes, movable pieces, and conversion of paths and drawn lines."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sized
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -87,11 +87,13 @@ def check_path(scene: Scene, path: Any, seconds: Any) -> tuple[Numbers, Numbers]
             go back.
     """
     pieces = max(len(scene.pieces), 1)
+    for key, values in (("path", path), ("seconds", seconds)):  # sizes before contents
+        count = len(values) if isinstance(values, Sized) else 0
+        require(count <= MOST_STEPS, key, f"at most {MOST_STEPS:,} steps", f"{count:,}; show it more quickly")
     places, times = _numbers("path", path), _numbers("seconds", seconds)
     fits = places.ndim == 3 and places.shape[1:] == (pieces, 2) and len(places)
     require(fits, "path", f"places of shape (step, {pieces}, 2)", str(places.shape))
     count = len(places)
-    require(count <= MOST_STEPS, "path", f"at most {MOST_STEPS:,} steps", f"{count:,}; show it more quickly")
     require(times.shape == (count,), "seconds", f"a time for each of {count:,} steps", f"shape {times.shape}")
     require(np.isfinite(places).all() and np.isfinite(times).all(), "path and seconds", "finite numbers", "others")
     require((np.diff(times) >= 0).all(), "seconds", "times that never go back", "some that do")

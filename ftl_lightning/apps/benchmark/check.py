@@ -3,10 +3,12 @@
 Only numbers and known names of suites and concepts are read from a file. No code that it names is run: the user names the method.
 """
 
+import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from statistics import NormalDist
 from tempfile import TemporaryDirectory
 
 from ftl_lightning.apps.benchmark.run import SHIPPED, Candidate
@@ -22,7 +24,9 @@ HASH = re.compile(r"(\d+:)?[0-9a-f]{16}")
 NAME = re.compile(r"[\w .+()-]{1,60}")  # allowed names of methods
 ROUNDING = 2e-6  # tolerance for values rounded to six decimals
 ERRORS = 3  # tolerance of rates in standard errors on another machine, where learning amplifies rounding
-MOST_REFERENCES = 20
+DISTANCE = 0.2  # relative tolerance of distances on another machine, taken as ERRORS standard errors
+LEVEL = 0.001  # two-sided probability that the tests of signed differences refuse an honest submission, all together
+MOST_REFERENCES, MOST_MACHINE, MOST_VERSION = 20, 20, 60
 
 
 def check_submission(path: Path) -> tuple[Submission, dict[str, BenchmarkSuite]]:
@@ -60,6 +64,8 @@ def _check_header(submission: Submission) -> None:
     require(tuple(submission.seeds) == SEEDS, "seeds", str(list(SEEDS)), list(submission.seeds))
     require(submission.suites, "suites", f"some of {', '.join(suite_names())}", "none")
     require(not submission.code or HASH.fullmatch(submission.code), "code", "a hash of 16 digits", "another text")
+    require(len(submission.version) <= MOST_VERSION, "version", f"at most {MOST_VERSION} characters", len(submission.version))
+    require(len(submission.machine) <= MOST_MACHINE, "machine", f"at most {MOST_MACHINE} entries", len(submission.machine))
     for key, value in submission.machine.items():
         require(len(key) + len(value) <= 200, "machine", "short texts", f"{len(key) + len(value)} characters")
 
@@ -116,9 +122,9 @@ def _check_scores(submission: Submission) -> None:
             require(abs(computed - given) <= ROUNDING, f"scores.{name}.{key}", f"{computed}, computed from the rows", given)
 
 
-def drawn(submission: Submission, share: float, salt: str) -> list[Run]:
-    """Draw the runs to run again, with at least a share of all rows. The draw depends on the file and a word, ``salt``: who does
-    not know the word cannot tune a file to a favourable draw.
+def drawn(submission: Submission, share: float, salt: str, whole: bool = False) -> list[Run]:
+    """Draw the runs to run again, with at least a share of all rows, and all runs of the drawn suites if ``whole``. The draw
+    depends on the file and a word, ``salt``: who does not know the word cannot tune a file to a favourable draw.
     """
     file_hash = submission.hash
     order = sorted(submission.runs, key=lambda run: content_hash([salt, file_hash, run.suite, run.seed]))
@@ -126,18 +132,19 @@ def drawn(submission: Submission, share: float, salt: str) -> list[Run]:
     runs: list[Run] = []
     while sum(len(run.rows) for run in runs) < minimum:
         runs.append(order[len(runs)])
-    return runs
+    suites = {run.suite for run in runs}
+    return [run for run in submission.runs if run.suite in suites] if whole else runs
 
 
 def allowed(submitted: float, repeated: float, n: int, rate: bool, alike: bool) -> bool:
     """Whether a number was reproduced: exactly on an alike machine (same processor, versions and threads), else approximately. A
-    rate is a fraction of ``n`` samples; other numbers may differ by a fifth on another machine.
+    rate is a fraction of ``n`` samples; other numbers may differ by :data:`DISTANCE` on another machine.
     """
     difference = abs(submitted - repeated)
     if alike or difference <= ROUNDING:
         return difference <= ROUNDING
     if not rate:
-        return difference <= 0.2 * max(submitted, repeated)
+        return difference <= DISTANCE * max(submitted, repeated)
     # Keep the standard error above 0 when all samples are right or wrong.
     mean = min(max((submitted + repeated) / 2, 1 / n), 1 - 1 / n)
     return difference <= ERRORS * (2 * mean * (1 - mean) / n) ** 0.5
@@ -166,6 +173,60 @@ def differences(run: Run, again: Run, suite: BenchmarkSuite, alike: bool) -> Ite
                     yield difference(where, value, repeated[measure])
 
 
+@dataclass
+class _Shift:
+    """Sums over pairs of a submitted and a repeated value of a measure: the values, their signed differences, and the variances
+    of these.
+    """
+
+    rows: int = 0
+    submitted: float = 0.0
+    repeated: float = 0.0
+    difference: float = 0.0
+    variance: float = 0.0
+
+    def add(self, submitted: float, repeated: float, n: int, rate: bool) -> None:
+        """Add a pair. Rates are fractions of ``n`` samples; distances are compared by their logarithms."""
+        self.rows, self.submitted, self.repeated = self.rows + 1, self.submitted + submitted, self.repeated + repeated
+        if rate:
+            # Variance of a 2 x 2 table with fixed margins, as in the test of Cochran, Mantel and Haenszel.
+            mean = (submitted + repeated) / 2
+            self.difference += submitted - repeated
+            self.variance += 4 * mean * (1 - mean) / (2 * n - 1)
+        elif submitted > 0 and repeated > 0:
+            self.difference += math.log(submitted / repeated)
+            self.variance += (math.log1p(DISTANCE) / ERRORS) ** 2
+
+    @property
+    def standardised(self) -> float:
+        """Sum of the differences in its standard errors; about standard normal if both values have the same expectation."""
+        return self.difference / self.variance**0.5 if self.variance else 0.0
+
+
+def shifted(pairs: Sequence[tuple[Run, Run]], suites: Mapping[str, BenchmarkSuite]) -> Iterator[str]:
+    """Measures whose submitted values are, all rows of a suite together, further from the repeated ones than chance explains, in
+    words. The scores of several suites are tested together, too. :data:`LEVEL` is shared equally by the tests.
+    """
+    shifts: dict[tuple[str, str], _Shift] = {}
+    for run, again in pairs:
+        known = {(row.setting, row.concept): row.measures for row in again.rows}
+        for row in run.rows:
+            repeated = known.get((row.setting, row.concept), {})
+            for measure in row.measures.keys() & repeated.keys():
+                shift = shifts.setdefault((run.suite, measure), _Shift())
+                shift.add(row.measures[measure], repeated[measure], row.n, suites[run.suite].is_rate(measure))
+    scores = [shifts[name, suite.headline] for name, suite in suites.items() if (name, suite.headline) in shifts]
+    bound = NormalDist().inv_cdf(1 - LEVEL / 2 / max(len(shifts) + (len(scores) > 1), 1))
+    for (name, measure), shift in sorted(shifts.items()):
+        if abs(shift.standardised) > bound:
+            means = f"submitted {shift.submitted / shift.rows:.3f}, found {shift.repeated / shift.rows:.3f}"
+            errors = f"{shift.standardised:+.1f} standard errors, expected {bound:.1f} at most"
+            yield f"{name}, mean {measure} of {shift.rows} rows: {means}: {errors}"
+    together = sum(shift.standardised for shift in scores) / max(len(scores), 1) ** 0.5
+    if len(scores) > 1 and abs(together) > bound:
+        yield f"scores of {len(scores)} suites together: {together:+.1f} standard errors, expected {bound:.1f} at most"
+
+
 def recompute(
     candidate: Candidate, submission: Submission, suites: Mapping[str, BenchmarkSuite], share: float, salt: str
 ) -> list[str]:
@@ -176,18 +237,21 @@ def recompute(
     if submission.code != code_hash(candidate.method):
         say("note: the method's code is not that of the submission", error=True)
     alike = dict(submission.machine) == machine() and submission.version == __version__
-    chosen = drawn(submission, share, salt)
+    chosen = drawn(submission, share, salt, whole=not alike)
     all_differences: list[str] = []
+    pairs: list[tuple[Run, Run]] = []
     count, total = (sum(len(run.rows) for run in runs) for runs in (chosen, submission.runs))
     say(f"running {len(chosen)} of {len(submission.runs)} runs again, {count} of {total} rows")
     if not alike:
-        say("note: another machine or version: rates may differ by three standard errors, as rounding does", error=True)
+        rates = "each rate may differ by three standard errors, and the rates of a suite together by chance"
+        say(f"note: another machine or version: {rates}; whole suites are run again", error=True)
     with TemporaryDirectory() as work:
         for run in chosen:
             # Given models default to the shipped models.
             model = SHIPPED if run.origin == GIVEN and not candidate.model else candidate.model
             again = replace(candidate, model=model, work=Path(work)).run(suites[run.suite], run.seed)
-            differing = list(differences(run, again, suites[run.suite], alike))
-            say(f"{run.suite}, seed {run.seed}: {f'{len(differing)} numbers differ' if differing else 'the same'}")
-            all_differences += differing
-    return all_differences
+            found = list(differences(run, again, suites[run.suite], alike))
+            say(f"{run.suite}, seed {run.seed}: {f'{len(found)} numbers differ' if found else 'the same'}")
+            all_differences += found
+            pairs.append((run, again))
+    return all_differences if alike else [*all_differences, *shifted(pairs, suites)]

@@ -1,20 +1,26 @@
 """Leaderboard page from a folder of submissions."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 
 from ftl_lightning.apps.benchmark.check import check_submission
-from ftl_lightning.apps.benchmark.submission import GIVEN, Row, Run, Score, Submission, score
+from ftl_lightning.apps.benchmark.references import References
+from ftl_lightning.apps.benchmark.submission import GIVEN, PRETRAINED, Run, Score, Submission, score
 from ftl_lightning.apps.benchmark.suite import BenchmarkSuite, load_suite, suite_names
 from ftl_lightning.services.errors import require
-from ftl_lightning.services.tensor_file import visible
+from ftl_lightning.services.shipped import list_models, pretrained_folder
+from ftl_lightning.services.tensor_file import file_hash, visible
 from ftl_lightning.services.text import markdown
+from ftl_lightning.training.model_folder import WEIGHTS
 
 BEGIN, END = "<!-- leaderboard: begin -->\n", "<!-- leaderboard: end -->\n"
+MARK = "≈"  # mark of methods whose numbers cannot be recomputed to the digit
 HEAD = """# Leaderboard
 
 This page is made by `ftl-lightning benchmark --leaderboard docs/leaderboard.md` from the files in `results/submissions`,
-each of which passes `benchmark --check`. [The protocol](benchmark.md) says what the numbers mean and how to add a line.
+each of which passes `benchmark --check`. Reference lines, in italics, were computed by this package; no submission changes them.
+[The protocol](benchmark.md) says what the numbers mean and how to add a line.
 """
 
 
@@ -52,47 +58,76 @@ def read_submissions(folder: Path) -> list[Submission]:
 
 def leaderboard(submissions: Sequence[Submission]) -> str:
     """Leaderboard page in Markdown."""
-    suites = [load_suite(name) for name in suite_names()]
+    suites, references = [load_suite(name) for name in suite_names()], References.load()
+    marks = {entry.name: reason for entry in submissions if (reason := inexact(entry, references))}
     chosen = [suite for suite in suites if any(suite.name in entry.suites for entry in submissions)]
-    parts = [HEAD, BEGIN, *(_section(suite, submissions) for suite in chosen)]
+    parts = [HEAD, BEGIN, *(_section(suite, submissions, references, marks) for suite in chosen)]
+    if marks:
+        parts.append(f"{MARK} These numbers cannot be recomputed to the digit ([how they are checked](benchmark.md)):\n")
+        parts += [f"- {markdown(name)}: {reason}" for name, reason in marks.items()] + [""]
     if missing := [suite.title for suite in suites if suite not in chosen]:
         parts.append(f"No submission has these suites yet: {', '.join(map(markdown, missing))}.\n")
     return "\n".join((*parts, END))
 
 
-def _section(suite: BenchmarkSuite, submissions: Sequence[Submission]) -> str:
+def inexact(submission: Submission, references: References) -> str:
+    """Why numbers of a submission cannot be recomputed to the digit, in Markdown; empty if they can. The machine of the reference
+    lines is the one that recomputes.
+    """
+    reasons = []
+    ours = {"ftl-lightning": references.version, **references.machine}
+    theirs = {"ftl-lightning": submission.version, **submission.machine}
+    if different := [f"{key} {theirs.get(key) or 'unknown'}" for key in ours | theirs if ours.get(key) != theirs.get(key)]:
+        reasons.append(f"measured with {markdown(', '.join(different))}")
+    foreign = sorted({run.suite for run in submission.runs if run.origin == GIVEN and run.model not in _shipped_hashes()})
+    if foreign:
+        reasons.append(f"given models that do not ship: {', '.join(foreign)}")
+    return "; ".join(reasons)
+
+
+@cache
+def _shipped_hashes() -> frozenset[str]:
+    """Hashes of all models that ship."""
+    files = (pretrained_folder(name) / WEIGHTS for name in list_models(baselines=True))
+    return frozenset(file_hash(path) for path in files if path.is_file())
+
+
+def _section(suite: BenchmarkSuite, submissions: Sequence[Submission], references: References, marks: Mapping[str, str]) -> str:
     runs = {
         entry.name: [run for run in entry.runs if run.suite == suite.name] for entry in submissions if suite.name in entry.suites
     }
     measures = [name if kind == "rate" else f"{name} (less is better)" for name, kind in suite.measures.items()]
     head = ["method", *measures, "model", "pretraining, s", "learning and evaluation, s"]
-    lines = sorted(_lines(suite, runs), key=lambda line: -line[0])
+    lines = [*_lines(suite, runs, marks), *_reference_lines(suite, references)]
+    lines.sort(key=lambda line: -line[0])
     table = [_row(head), _row(["---"] * len(head)), *(_row(cells) for _, cells in lines)]
     return f"## {markdown(suite.title)}\n\n" + "\n".join(table) + "\n"
 
 
-def _lines(suite: BenchmarkSuite, runs: Mapping[str, Sequence[Run]]) -> Iterator[tuple[float, list[str]]]:
-    """Score and cells of each line: methods, then reference policies of the first submission with them."""
-    others = [name for name in suite.measures if name != suite.headline]
+def _lines(suite: BenchmarkSuite, runs: Mapping[str, Sequence[Run]], marks: Mapping[str, str]) -> Iterator[tuple[float, list[str]]]:
+    """Score and cells of each method."""
     for name, group in runs.items():
-        rows = [run.rows for run in group]
-        main = score(suite, rows)
-        model = "given" if group[0].origin == GIVEN else "pretrained"
-        times = [f"{sum(getattr(run, key) for run in group) / len(group):.0f}" for key in ("pretraining_seconds", "seconds")]
-        times[0] = "-" if group[0].origin == GIVEN else times[0]
-        yield (
-            main.mean,
-            [f"**{markdown(name)}**", _shown(main), *(_shown(score(suite, rows, measure)) for measure in others), model, *times],
-        )
-    references: dict[str, list[Sequence[Row]]] = {}
-    for group in runs.values():
-        common = set.intersection(*(set(run.references) for run in group))
-        references = {name: [run.references[name] for run in group] for name in sorted(common)} | references
-    for name, known in references.items():
-        main = score(suite, known)
-        measured = set.intersection(*({*row.measures} for seed_rows in known for row in seed_rows))
-        cells = [_shown(score(suite, known, measure)) if measure in measured else "-" for measure in others]
-        yield main.mean, [f"*{markdown(name)}*", _shown(main), *cells, "-", "-", "-"]
+        scores = [score(suite, [run.rows for run in group], measure) for measure in suite.measures]
+        method = f"**{markdown(name)}**{f' {MARK}' if name in marks else ''}"
+        pretraining = [run.pretraining_seconds for run in group if run.origin != GIVEN]
+        times = [f"{sum(known) / len(known):.0f}" if known else "-" for known in (pretraining, [run.seconds for run in group])]
+        yield scores[0].mean, [method, *map(_shown, scores), _origins(group), *times]
+
+
+def _origins(group: Sequence[Run]) -> str:
+    """Origin of the models; with seeds where it differs."""
+    seeds = {origin: [str(run.seed) for run in group if run.origin == origin] for origin in (PRETRAINED, GIVEN)}
+    known = {origin: numbers for origin, numbers in seeds.items() if numbers}
+    if len(known) == 1:
+        return next(iter(known))
+    return ", ".join(f"{origin} (seed{'s' * (len(numbers) > 1)} {', '.join(numbers)})" for origin, numbers in known.items())
+
+
+def _reference_lines(suite: BenchmarkSuite, references: References) -> Iterator[tuple[float, list[str]]]:
+    """Score and cells of each reference policy."""
+    for name, scores in references.scores.get(suite.name, {}).items():
+        cells = [_shown(scores[measure]) if measure in scores else "-" for measure in suite.measures]
+        yield scores[suite.headline].mean, [f"*{markdown(name)}*", *cells, "-", "-", "-"]
 
 
 def _shown(value: Score) -> str:

@@ -13,6 +13,7 @@ async function request(path, body, signal) {
   if (closed) throw gone();
   const raw = body instanceof Blob;
   const headers = { "X-Token": token };
+  if (state && state.model.name) headers["X-Model"] = encodeURIComponent(state.model.name);
   if (body !== undefined) headers["Content-Type"] = raw ? "application/octet-stream" : "application/json";
   let response;
   try {

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from ftl_lightning.services.errors import require
 from ftl_lightning.services.validation import check_count, check_factor, check_range
@@ -32,11 +33,13 @@ class Pose:
 
 @dataclass(frozen=True)
 class Recorded:
-    """Demonstration recorded by hand in a scene: positions ``(step, piece, 2)`` in the film's unit, and seconds from any zero."""
+    """Demonstration recorded by hand in a scene: positions ``(step, piece, 2)`` in the film's unit, and seconds from any zero. They
+    are checked by :func:`~ftl_lightning.domains.recorder.check_path`, sizes first.
+    """
 
     scene: int
-    path: Sequence[Sequence[Sequence[float]]]
-    seconds: Sequence[float]
+    path: Any
+    seconds: Any
 
 
 @dataclass(frozen=True)

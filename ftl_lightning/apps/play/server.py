@@ -8,7 +8,7 @@ import secrets
 import socket
 import webbrowser
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import FrameType
 from typing import Any
 
@@ -21,16 +21,15 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from ftl_lightning.apps.play.connections import Connection, Limits
 from ftl_lightning.services.errors import UserError, mistake_of_machine, short
 from ftl_lightning.services.text import line, say
 
 LOOPBACK = "127.0.0.1"
 PORT = 8765  # default port, unless another program uses it
-MOST_CONNECTIONS, IDLE, PATIENCE = 200, 5, 3
-"""Maximum number of connections, seconds before an idle connection is closed, and seconds for the last answers at the end."""
+PATIENCE = 3  # seconds for the last answers at the end
 TOKEN = "x-token"  # header required in every request but the first
-RECEIVE_SECONDS, END_SECONDS = 30.0, 0.25
-"""Maximum seconds to receive a request, and seconds from the request to end the program to its end."""
+END_SECONDS = 0.25  # seconds from the request to end the program to its end
 HEADERS: Mapping[str, str] = {
     "x-content-type-options": "nosniff",
     "referrer-policy": "no-referrer",
@@ -99,24 +98,30 @@ class Guard:
 
 async def body_of(request: Request, most: int) -> bytes:
     """Read the bytes of a request. Raise HTTPException for more than ``most`` bytes, or if they take too long."""
-    message = f"expected at most {most // 2**20} MB, found more"
+    size, seconds = f"{most // 2**20} MB" if most >= 2**20 else f"{most // 2**10} kB", request.app.state.limits.body
+    message = f"expected at most {size}, found more"
     length = request.headers.get("content-length", "0")
     if not length.isdecimal() or int(length) > most:
         raise HTTPException(413, message)
     content = bytearray()
     try:
-        async with asyncio.timeout(RECEIVE_SECONDS):
+        async with asyncio.timeout(seconds):
             async for part in request.stream():
                 content += part
                 if len(content) > most:
                     raise HTTPException(413, message)
     except TimeoutError as error:
-        raise HTTPException(408, f"expected a whole question within {RECEIVE_SECONDS:.0f} seconds, found a part") from error
+        raise HTTPException(408, f"expected a whole question within {seconds:g} seconds, found a part") from error
     return bytes(content)
 
 
 def guarded(
-    routes: Sequence[Route], token: str, hosts: Sequence[str], end: Callable[[], None], begin: Begin | None = None
+    routes: Sequence[Route],
+    token: str,
+    hosts: Sequence[str],
+    end: Callable[[], None],
+    begin: Begin | None = None,
+    limits: Limits = Limits(),  # noqa: B008 (frozen)
 ) -> Starlette:
     """Application of a single page: answer requests that name the token and one of the ``hosts`` (``host:port``), by ``routes`` or
     by ``end``, which ends the program. ``begin`` is called at the start.
@@ -136,6 +141,7 @@ def guarded(
     handlers: Any = {HTTPException: _refused, **dict.fromkeys(MISTAKES, _mistaken)}
     all_routes = [*routes, Route("/api/end", ended, methods=["POST"])]
     application = Starlette(routes=all_routes, exception_handlers=handlers, lifespan=lifespan)
+    application.state.limits = limits
     application.add_middleware(Guard, token=token, hosts=frozenset(hosts))
     return application
 
@@ -163,12 +169,13 @@ async def _mistaken(request: Request, error: Exception) -> Response:
 @dataclass(frozen=True)
 class Place:
     """Address of a page; any host but the loopback admits other machines, with a warning. Port 0 is :data:`PORT`, or any if that is
-    in use.
+    in use. ``limits`` are those of connections and requests.
     """
 
     host: str = LOOPBACK
     port: int = 0
     browser: bool = True
+    limits: Limits = field(default_factory=Limits)
 
 
 def serve(routes: Sequence[Route], place: Place, begin: Begin | None = None, close: Callable[[], None] = lambda: None) -> None:
@@ -176,14 +183,18 @@ def serve(routes: Sequence[Route], place: Place, begin: Begin | None = None, clo
     listening = _listening(place.host, place.port)
     port, names, token = listening.getsockname()[1], _names(place.host), secrets.token_urlsafe(24)
     hosts = [f"{name}:{port}" for name in names]
-    app = guarded(routes, token, hosts, lambda: server.end(), begin)
+    app = guarded(routes, token, hosts, lambda: server.end(), begin, place.limits)
+
+    class Limited(Connection):
+        limits = place.limits
+
     config = uvicorn.Config(
         app,
+        http=Limited,
         log_level="critical",
         ws="none",
         server_header=False,
-        limit_concurrency=MOST_CONNECTIONS,
-        timeout_keep_alive=IDLE,
+        timeout_keep_alive=place.limits.idle,
         timeout_graceful_shutdown=PATIENCE,
     )
     server = _Server(config, close)

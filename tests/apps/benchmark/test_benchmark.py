@@ -8,15 +8,21 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
-from ftl_lightning.apps.benchmark.check import allowed, check_submission, drawn
+from ftl_lightning.apps.benchmark.check import allowed, check_submission, drawn, shifted
 from ftl_lightning.apps.benchmark.leaderboard import leaderboard, read_submissions
-from ftl_lightning.apps.benchmark.submission import Submission, scored
+from ftl_lightning.apps.benchmark.references import References
+from ftl_lightning.apps.benchmark.run import Candidate
+from ftl_lightning.apps.benchmark.submission import Row, Run, Submission, scored
+from ftl_lightning.apps.benchmark.suite import load_suite
 from ftl_lightning.cli.main import main
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.services.errors import LONGEST
+from ftl_lightning.services.shipped import MODELS
+from ftl_lightning.services.tensor_file import file_hash
 from tests.conftest import ROOT, Once, succeed
 
 RUN = ["benchmark", "replay", "--suites", "beats"]
@@ -122,6 +128,8 @@ TAMPERED: list[tuple[Callable[[Any], None], str]] = [
     (_set("format", 2), "format: expected 1, found 2"),
     (_set("name", "<b>best</b>"), "name: expected letters, digits"),
     (_set("code", "../../etc"), "code: expected a hash of 16 digits"),
+    (_set("version", "9" * 1000), "version: expected at most 60 characters, found 1000"),
+    (_set("machine", {str(number): "" for number in range(100)}), "machine: expected at most 20 entries, found 100"),
     (_set("seeds", [0, 1]), "seeds: expected [0, 1, 2], found [0, 1]"),
     (_set("suites", {"../../agent": "0"}), "suites: expected some of agent, beats"),
     (_set("suites", {"beats": "0123456789abcdef"}), "suites.beats: expected the frozen suite's hash"),
@@ -258,6 +266,160 @@ def test_the_leaderboard_of_a_folder(copy: Path, capsys: pytest.CaptureFixture[s
     shutil.copy("all/replay.json", "all/twice.json")
     assert "expected one submission of 'replay', found two" in line_of(capsys, "--leaderboard", "page.md", "--submissions", "all")
     assert "expected a folder of submissions" in line_of(capsys, "--leaderboard", "page.md", "--submissions", "none")
+
+
+def page_of(*files: Path) -> str:
+    """The leaderboard of some files."""
+    folder = Path("all")
+    folder.mkdir()
+    for path in files:
+        shutil.copy(path, folder)
+    succeed("benchmark", "--leaderboard", "page.md", "--submissions", "all")
+    return Path("page.md").read_text(encoding="utf-8")
+
+
+def test_no_submission_changes_a_reference_line(copy: Path) -> None:
+    submission, honest = Submission.load(copy), committed_references("beats")
+    for value, name in ((0.0, "a first"), (1.0, "z last")):
+        lines = {
+            line: [replace(row, measures=dict.fromkeys(row.measures, value)) for row in rows]
+            for line, rows in submission.runs[0].references.items()
+        }
+        lines["generous (oracle)"] = lines["generator (oracle)"]
+        replace(submission, name=name, runs=[replace(run, references=lines) for run in submission.runs]).save(Path(f"{name}.json"))
+    page = page_of(copy, Path("a first.json"), Path("z last.json"))
+    assert [line for line in page.splitlines() if line.startswith("| *") and line[3] != "*"] == honest
+    assert "generous" not in page
+
+
+def committed_references(name: str) -> list[str]:
+    """Reference lines of a suite on the committed page, highest first."""
+    suite = load_suite(name)
+    section = (
+        (ROOT / "docs" / "leaderboard.md").read_text(encoding="utf-8").partition(f"## {suite.title}\n")[2].partition("\n## ")[0]
+    )
+    return [line for line in section.splitlines() if line.startswith("| *") and line[3] != "*"]
+
+
+def test_reference_lines_are_those_of_the_committed_results() -> None:
+    known = References.load()
+    assert known == References.of(Submission.load(ROOT / "results" / "submissions" / "ftl_igm.json"))
+    assert known.suites == {name: load_suite(name).hash for name in known.suites}
+    for path in (ROOT / "results" / "submissions").glob("*.json"):
+        measured = References.of(Submission.load(path)).scores
+        assert measured == {name: known.scores[name] for name in measured}
+
+
+def test_mixed_origins_are_all_shown(copy: Path) -> None:
+    submission = Submission.load(copy)
+    given = replace(submission.runs[0], origin="given", pretraining_seconds=0.0, model=shipped_hash())
+    given = replace(given, data={part: value for part, value in given.data.items() if part != "training"})
+    late = [replace(run, pretraining_seconds=8.0) for run in submission.runs[1:]]
+    machine = References.load().machine
+    replace(submission, machine=machine, runs=[given, *late]).save(copy)
+    (line,) = [line for line in page_of(copy).splitlines() if line.startswith("| **replay**")]
+    assert [cell.strip() for cell in line.split("|")[4:6]] == ["pretrained (seeds 1, 2), given (seed 0)", "8"]
+    assert "≈" not in line
+
+
+def shipped_hash() -> str:
+    return file_hash(MODELS / "agent" / "model.safetensors")
+
+
+def test_what_cannot_be_recomputed_to_the_digit_is_marked(copy: Path) -> None:
+    submission, references = Submission.load(copy), References.load()
+    given = [replace(run, origin="given", data={"demonstrations": run.data["demonstrations"]}) for run in submission.runs]
+    variants = {
+        "exact": {"machine": references.machine},
+        "elsewhere": {"machine": {**references.machine, "processor": "Other <b>"}},
+        "nameless": {"machine": {}},
+        "later": {"machine": references.machine, "version": "9.9"},
+        "stranger": {"machine": references.machine, "runs": given},
+    }
+    for name, changes in variants.items():
+        replace(submission, name=name, **changes).save(Path(f"{name}.json"))
+    page = page_of(*(Path(f"{name}.json") for name in variants))
+    methods = [line.split("|")[1].strip() for line in page.splitlines() if line.startswith("| **")]
+    assert sorted(methods) == ["**elsewhere** ≈", "**exact**", "**later** ≈", "**nameless** ≈", "**stranger** ≈"]
+    legend = page.partition("≈ These numbers cannot be recomputed")[2]
+    assert "- elsewhere: measured with processor Other" in legend
+    assert "<b>" not in legend
+    assert "- later: measured with ftl" in legend
+    assert "- stranger: given models that do not ship: beats" in legend
+
+
+def elsewhere(path: Path, monkeypatch: pytest.MonkeyPatch, here: float, there: float, coverage: float = 1.0) -> Submission:
+    """A submission of another machine, with a rate in all rows and coverage times a factor, and another rate if it is run here."""
+    known = Submission.load(path)
+
+    def runs(rate: float, factor: float) -> list[Run]:
+        def changed(row: Row) -> Row:
+            return replace(row, measures={"accuracy": rate, "coverage": round(row.measures["coverage"] * factor, 6)})
+
+        return [replace(run, rows=[changed(row) for row in run.rows]) for run in known.runs]
+
+    honest = {run.seed: run for run in runs(here, 1.0)}
+    monkeypatch.setattr(Candidate, "run", lambda self, suite, seed: honest[seed])
+    submission = scored(replace(known, machine={**known.machine, "processor": "another"}, runs=runs(there, coverage)))
+    submission.save(path)
+    return submission
+
+
+@pytest.mark.parametrize(("here", "there"), [(0.86, 0.94), (0.92, 1.0), (0.5, 0.64), (0.64, 0.5)])
+def test_rates_that_are_all_shifted_are_refused(
+    here: float, there: float, copy: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    elsewhere(copy, monkeypatch, here, there)
+    assert allowed(there, here, 50, rate=True, alike=False)  # each by itself
+    assert "expected the submitted numbers, found 1 that differ" in line_of(capsys, "replay", "--check", str(copy))
+    assert main(["benchmark", "replay", "--check", str(copy)]) == 2
+    told = capsys.readouterr()
+    assert "running 3 of 3 runs again, 12 of 12 rows" in told.out
+    assert f"differs: beats, mean accuracy of 12 rows: submitted {there:.3f}, found {here:.3f}: " in told.out
+    assert "standard errors, expected 3.5 at most" in told.out
+
+
+def test_distances_that_are_all_less_are_refused(
+    copy: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    elsewhere(copy, monkeypatch, 0.9, 0.9, coverage=0.85)
+    assert main(["benchmark", "replay", "--check", str(copy)]) == 2
+    assert "differs: beats, mean coverage of 12 rows: submitted " in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("here", "there", "coverage"), [(1.0, 1.0, 1.0), (0.5, 0.54, 0.97), (0.94, 0.9, 1.04), (0.0, 0.0, 1.0)])
+def test_small_shifts_elsewhere_pass(
+    here: float, there: float, coverage: float, copy: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    elsewhere(copy, monkeypatch, here, there, coverage)
+    assert main(["benchmark", "replay", "--check", str(copy)]) == 0
+    assert "another machine or version: each rate may differ by three standard errors" in capsys.readouterr().err
+
+
+TWO = {name: load_suite(name) for name in ("beats", "strokes")}
+
+
+def honest_shifts(seed: int, better: float = 0.0) -> list[str]:
+    """Shifts of two suites whose true rates are those of a repetition, or a little better."""
+    rng = np.random.default_rng(seed)
+
+    def run(name: str, number: int, more: float) -> Run:
+        rows = []
+        for index, task in enumerate(TWO[name].test):
+            rate = rng.binomial(50, min(0.3 + 0.1 * index + more, 1.0)) / 50
+            distance = float(np.exp(rng.normal(0, 0.04)))
+            rows.append(Row(setting=task.setting, concept=task.concept, n=50, measures={"accuracy": rate, "coverage": distance}))
+        return Run(
+            suite=name, seed=number, model="", origin="", data={}, configuration="", pretraining_seconds=0, seconds=0, rows=rows
+        )
+
+    return list(shifted([(run(name, number, better), run(name, number, 0.0)) for name in TWO for number in range(3)], TWO))
+
+
+def test_honest_rates_are_refused_as_seldom_as_the_page_says() -> None:
+    assert sum(bool(honest_shifts(seed)) for seed in range(500)) <= 3
+    assert sum(bool(honest_shifts(seed, 0.15)) for seed in range(50)) >= 45
+    assert any("scores of 2 suites together" in line for seed in range(50) for line in honest_shifts(seed, 0.1))
 
 
 def test_the_committed_leaderboard_is_what_the_submissions_say() -> None:

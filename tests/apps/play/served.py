@@ -16,17 +16,21 @@ from functools import partial
 from pathlib import Path
 from time import monotonic
 from typing import Any
-from urllib.parse import urlsplit
+from urllib.parse import quote, urlsplit
 
 import pytest
 
 import ftl_lightning.apps.play.application  # noqa: F401 - before the work of a test is measured
 from ftl_lightning.apps.play import server
+from ftl_lightning.apps.play.connections import Limits
+from ftl_lightning.apps.play.server import Place
 from ftl_lightning.cli.main import main
 from tests.conftest import environment
 
 PATIENCE = 120.0
 """Seconds that anything may take before a test fails."""
+UNNAMED = ("/api/state", "/api/open", "/api/end")
+"""Questions that need no model."""
 
 
 @dataclass
@@ -44,6 +48,8 @@ class Served:
     """Ends it from outside."""
     seconds: float
     """From the command to the address."""
+    model: str = ""
+    """That questions name: the first, or the one opened last."""
 
     @property
     def token(self) -> str:
@@ -57,10 +63,12 @@ class Served:
         self, method: str, path: str, body: bytes | str | None = None, headers: Mapping[str, str] | None = None
     ) -> tuple[int, bytes, Mapping[str, str]]:
         """Status, bytes and headers of an answer; headers that are given take the place of the usual ones."""
-        connection = http.client.HTTPConnection(*self._at, timeout=PATIENCE)
+        if not self.model and path not in UNNAMED and path.startswith("/api/"):
+            self.model = self.get("/api/state")["model"]["name"]
+        connection = http.client.HTTPConnection(*self.at, timeout=PATIENCE)
         try:
             connection.putrequest(method, path, skip_host=True, skip_accept_encoding=True)
-            usual = {"Host": self.host, "X-Token": self.token, "Content-Type": "application/json"}
+            usual = {"Host": self.host, "X-Token": self.token, "X-Model": quote(self.model), "Content-Type": "application/json"}
             content = body.encode() if isinstance(body, str) else body
             if content is not None:
                 usual["Content-Length"] = str(len(content))
@@ -74,13 +82,18 @@ class Served:
             connection.close()
 
     @property
-    def _at(self) -> tuple[str, int]:
+    def at(self) -> tuple[str, int]:
         name, _, port = self.host.partition(":")
         return name, int(port)
 
+    def head(self, path: str, length: int) -> str:
+        """Headers of a question with a body, without the empty line at their end."""
+        names = {"Host": self.host, "X-Token": self.token, "X-Model": quote(self.model), "Content-Length": str(length)}
+        return "".join((f"POST {path} HTTP/1.1\r\n", *(f"{name}: {value}\r\n" for name, value in names.items())))
+
     def send(self, sent: bytes, first: bool = False) -> None:
         """Send bytes that need not be a question, and read what comes until the server hangs up, or its first bytes."""
-        with socket.create_connection(self._at, timeout=PATIENCE) as connection:
+        with socket.create_connection(self.at, timeout=PATIENCE) as connection:
             connection.sendall(sent)
             if first:
                 assert connection.recv(1000)
@@ -93,7 +106,10 @@ class Served:
         return json.loads(self._content("GET", path))
 
     def post(self, path: str, asked: Any) -> Any:
-        return json.loads(self._content("POST", path, json.dumps(asked)))
+        found = json.loads(self._content("POST", path, json.dumps(asked)))
+        if path == "/api/open":
+            self.model = asked["model"]
+        return found
 
     def learn(self, name: str) -> list[Any]:
         """The lines that learning tells."""
@@ -106,8 +122,11 @@ class Served:
 
 
 @contextmanager
-def here(folder: Path, *arguments: str) -> Iterator[Served]:
-    """Run a verb in a thread of this process, in a folder, until the block ends: all of the program but its start."""
+def here(folder: Path, *arguments: str, limits: Limits | None = None) -> Iterator[Served]:
+    """Run a verb in a thread of this process, in a folder, until the block ends: all of the program but its start.
+
+    Limits take the place of the usual ones.
+    """
     begin, told, ended = monotonic(), list[str](), list[int]()
     lines = queue.SimpleQueue[str]()
 
@@ -127,6 +146,7 @@ def here(folder: Path, *arguments: str) -> Iterator[Served]:
     thread = threading.Thread(target=run, daemon=True)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(server, "say", say)
+        patch.setattr(server, "Place", partial(Place, limits=limits or Limits()))
         patch.setenv("XDG_DATA_HOME", str(folder / "data"))  # no concepts of the person who runs the tests
         patch.chdir(folder)
         thread.start()

@@ -154,7 +154,6 @@ def test_whoever_leaves_in_the_middle_of_learning_stops_it(scenes: Served, monke
     monkeypatch.setattr(Workspace, "_settings", lambda self, quick: ({"tolerance": None}, 10**6))  # steps, which nobody waits for
     scenes.post("/api/draw", {"task": "circle above square", "count": 3})
     body = json.dumps({"name": "left"})
-    head = f"POST /api/learn HTTP/1.1\r\nHost: {scenes.host}\r\nX-Token: {scenes.token}\r\nContent-Length: {len(body)}\r\n\r\n"
-    scenes.send((head + body).encode(), first=True)
+    scenes.send(f"{scenes.head('/api/learn', len(body))}\r\n{body}".encode(), first=True)
     answers(scenes)
     assert "left" not in [one["name"] for one in scenes.get("/api/state")["concepts"]]

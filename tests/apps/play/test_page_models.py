@@ -139,6 +139,33 @@ def test_learning_is_not_stopped_by_another_model_without_a_question(page: Brows
     assert page.text("error-text") == ""
 
 
+def test_two_tabs_show_two_models(page: Browser, several: Served) -> None:
+    windows = page.driver.switch_to
+    first = page.driver.current_window_handle
+    windows.new_window("tab")
+    try:
+        opened(page, several)
+        choose(page, "agent")
+        second = page.driver.current_window_handle
+        windows.window(first)
+        page.window()
+        take(page)
+        page.until(lambda: page.count("#learned") == 1)
+        assert "from_pretrained('strokes')" in page.js("find('python').textContent")
+        assert page.text("error-text") == ""
+        windows.window(second)
+        assert page.js("state.model.name") == "agent"
+        before = int(page.data("samples"))
+        page.click("noise")
+        page.sampled(before)
+        assert "from_pretrained('agent')" in page.js("find('python').textContent")
+        assert not page.js("state.work.demonstrations.length")
+        assert not page.errors()
+        page.driver.close()
+    finally:
+        windows.window(first)
+
+
 def test_the_end_is_asked_for_and_calm(chromium: Browser, tmp_path: Path) -> None:
     with here(tmp_path, "play", "--pretrained", "strokes") as server:
         page = opened(chromium, server)
