@@ -250,13 +250,4 @@ def check_concept(model: ConceptModel, concept: Concept, path: str | Path) -> No
         value, wanted = getattr(concept.origin, key), f"{expected!r} (the pretrained model's)"
         require(value == expected, f"{path}: key {key!r}", wanted, f"{short(value)!r}; learn it again")
     with about(path):
-        check_sizes(model, concept)
-
-
-def check_sizes(model: ConceptModel, concept: Concept) -> None:
-    """Refuse a concept whose sizes do not fit a model; ``UserError`` with the key."""
-    place, size = "key 'embeddings'", model.config.concept_dim
-    require(concept.embeddings.shape[2] == size, place, f"{size} numbers each", concept.embeddings.shape[2])
-    require(concept.knots == 1 or model.over_time, place, "1 knot for this model", concept.knots)
-    if concept.adapter is not None:
-        model.check_adapter(concept.adapter)
+        model.check_sizes(concept)

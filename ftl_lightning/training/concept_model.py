@@ -128,7 +128,10 @@ class ConceptModel(Shown, nn.Module, ABC):
             UserError: for settings that the model does not support, or a loss that is not finite.
         """
         if not self.invertible:
-            return self.read_concepts(demonstrations)
+            concepts = self.read_concepts(demonstrations)
+            for concept in concepts.values():
+                self.check_sizes(concept)
+            return concepts
         pretrained = self.config.training.get("model", {}).get("loss", settings.loss.kind)
         if pretrained != settings.loss.kind:
             text = "model.loss.kind: the model was pretrained with %r; with %r concepts are learned worse"
@@ -143,6 +146,14 @@ class ConceptModel(Shown, nn.Module, ABC):
         """
         name = self.method.name
         raise UserError(f"model.pretrained: expected a model that learns or reads concepts, found one of {name}; mend its package")
+
+    def check_sizes(self, concept: Concept) -> None:
+        """Refuse a concept whose sizes do not fit the model; ``UserError`` with the key."""
+        place, size = "key 'embeddings'", self.config.concept_dim
+        require(concept.embeddings.shape[2] == size, place, f"{size} numbers each", concept.embeddings.shape[2])
+        require(concept.knots == 1 or self.over_time, place, "1 knot for this model", concept.knots)
+        if concept.adapter is not None:
+            self.check_adapter(concept.adapter)
 
     def check_settings(self, settings: InversionSettings) -> None:
         """Refuse settings that the model does not support; ``UserError`` with the key."""
