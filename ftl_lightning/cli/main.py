@@ -5,6 +5,7 @@ import os
 import sys
 from argparse import ArgumentError
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -121,7 +122,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # Never unpickle, whatever a library's default is.
     os.environ["TORCH_FORCE_WEIGHTS_ONLY_LOAD"] = "1"
     try:
-        with trust.person(verb, read) as rest:
+        with trust.person(verb, read) as rest, _modes():
             _dispatch(verb, rest)
     except UserError as error:
         return _refused(str(error))
@@ -140,6 +141,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return _interrupted()
         return stop.code if isinstance(stop.code, int) else 0 if stop.code is None else 2
     return 0
+
+
+def _modes() -> AbstractContextManager[None]:
+    """The usual modes of torch, which a program that calls :func:`main` may have changed; torch is not imported for this."""
+    if "torch" not in sys.modules:
+        return nullcontext()
+    from ftl_lightning.services.modes import usual_modes
+
+    return usual_modes()
 
 
 def _refused(message: str) -> int:

@@ -20,6 +20,7 @@ from ftl_lightning.igm.forms.stopping import Stopping
 from ftl_lightning.igm.model import Invertible
 from ftl_lightning.igm.settings import CONCEPTS, EXPLAINED, REDUCED, InversionSettings
 from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.modes import usual_modes
 from ftl_lightning.services.randomness import generator, task_key
 
 FINAL_SAMPLES = 128
@@ -33,6 +34,7 @@ Watch = Callable[[int, float, Callable[[], dict[str, Concept]]], None]
 """Callback after a gradient step: the step's number from 1, its mean loss, and a function that returns the concepts so far."""
 
 
+@usual_modes()
 def invert(
     model: Invertible,
     demonstrations: Demonstrations,

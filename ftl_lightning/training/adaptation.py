@@ -18,6 +18,7 @@ from ftl_lightning.igm.concept import NEW_COMPONENT, Concept, Point, file_name
 from ftl_lightning.igm.library import concept_files, write_concept
 from ftl_lightning.services import log_folder
 from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.modes import usual_modes
 from ftl_lightning.services.text import say
 from ftl_lightning.training.checks import longer_than_plans, notes_of
 from ftl_lightning.training.concept_model import ConceptModel
@@ -147,6 +148,7 @@ class Adaptation(pl.LightningModule, ABC):
         """Folder of the learned concepts."""
         return Path(self._output or Path(self.trainer.log_dir or self.trainer.default_root_dir) / "concepts")
 
+    @usual_modes()
     def find(self) -> None:
         """Learn the concepts and write each to a file."""
         log_folder.keep()  # also without training

@@ -21,6 +21,7 @@ from ftl_lightning.domains.from_file import OWN, domain_from_file, read_demonstr
 from ftl_lightning.domains.registry import load_domain, recorded_name
 from ftl_lightning.networks.text_encoder import Encoder, load_encoder
 from ftl_lightning.services.errors import UserError, require, short
+from ftl_lightning.services.modes import single_precision
 from ftl_lightning.services.randomness import DEMONSTRATION_SEED, drawn, generator, rows_of
 from ftl_lightning.services.validation import LARGEST_STEP, MOST_TOGETHER, check_count, check_factor, check_range
 
@@ -143,6 +144,7 @@ class PretrainingData(pl.LightningDataModule):
         """Recorded name and domain."""
         return recorded_name(name), load_domain(name)
 
+    @single_precision()
     def setup(self, stage: str) -> None:
         source = self.domain.source(self.root)
         self.training = source.split("train", self.samples_per_concept, self.seed).fitted(self.domain.observed)
@@ -172,6 +174,7 @@ class PretrainingData(pl.LightningDataModule):
         """Demonstrations saved with a model of user data, else ``None``."""
         return None
 
+    @single_precision()
     def batch(self, step: int) -> Batch:
         """Batch of a step (this process's share): demonstrations drawn with replacement, a window of each."""
         draw, count = generator("cpu", self.seed, step), self.batch_size
@@ -218,6 +221,7 @@ class PretrainingData(pl.LightningDataModule):
         steps = Steps(self, self.steps_per_epoch)
         return DataLoader(steps, batch_size=None, collate_fn=self.batch)  # type: ignore[arg-type]
 
+    @single_precision()
     def val_dataloader(self) -> DataLoader[Batch]:
         whole = torch.arange(len(self.validation))
         batch = self._windows(self.validation, whole, generator("cpu", self.seed))

@@ -23,6 +23,7 @@ from ftl_lightning.igm.concept import Point
 from ftl_lightning.networks.image_encoder import ImageEncoders
 from ftl_lightning.networks.text_encoder import EMPTY
 from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.modes import single_precision
 from ftl_lightning.services.randomness import generator, mean, rows_of
 from ftl_lightning.services.tensor_file import check_finite
 from ftl_lightning.services.validation import LARGEST_FACTOR, LARGEST_RATE, check_factor, check_range, groups_of
@@ -144,6 +145,7 @@ class Pretraining(pl.LightningModule, ABC, Generic[M]):
             with torch.device("cpu"):  # with the data; Lightning moves the layers afterwards
                 self._configure()
 
+    @single_precision()
     def _configure(self) -> None:
         data = self.trainer.datamodule  # type: ignore[attr-defined]
         if not isinstance(data, PretrainingData):
@@ -229,6 +231,7 @@ class Pretraining(pl.LightningModule, ABC, Generic[M]):
         """Check the restored state."""
         check_restored(self, self.resumed_from)
 
+    @single_precision()
     def training_step(self, batch: Batch) -> Tensor:
         with rows_of(self.trainer.global_rank, self.trainer.world_size):
             return self._training_loss(batch)
@@ -263,6 +266,7 @@ class Pretraining(pl.LightningModule, ABC, Generic[M]):
                 # No public name: one call for all parameters instead of one for each.
                 torch._foreach_lerp_(list(self.model.parameters()), list(self.raw.parameters()), 1 - decay)
 
+    @single_precision()
     def _evaluation_step(self, batch: Batch, name: str) -> None:
         # Fixed noise, so that the curve shows the model alone. Each process evaluates the whole set.
         loss = self._perturbed_losses(self.model, batch, generator(self.device, self.seed))[0].mean()

@@ -18,7 +18,8 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from ftl_lightning.services import log_folder
 from ftl_lightning.services.errors import UserError, mistake_behind, mistake_of_machine, require, short
-from ftl_lightning.services.text import line, silence
+from ftl_lightning.services.modes import single_precision, usual_modes
+from ftl_lightning.services.text import line, say, silence
 from ftl_lightning.services.validation import check_count, check_range
 from ftl_lightning.training.adaptation import Adaptation
 from ftl_lightning.training.board import LearningRate
@@ -146,6 +147,7 @@ class Trainer(pl.Trainer):
         processes = self.num_devices * self.num_nodes
         require(processes == 1, "trainer.devices", f"1 for {verb}", f"{processes}; {instead}")
 
+    @usual_modes()
     def fit(self, model: pl.LightningModule, *arguments: Any, **options: Any) -> None:
         """Lightning's ``fit``, for models that learn."""
         if isinstance(model, Adaptation) and not model.learns:
@@ -168,12 +170,14 @@ class Trainer(pl.Trainer):
                 raise
         _expect_monitors(self)
 
+    @single_precision()
     def validate(self, *arguments: Any, **options: Any) -> Any:
         """Lightning's ``validate``, in one process."""
         self.check_alone("validate")
         with self._restoring():
             return super().validate(*arguments, **options)
 
+    @single_precision()
     def test(self, *arguments: Any, **options: Any) -> Any:
         """Lightning's ``test``, in one process."""
         self.check_alone(self.verb if self.verb == "invert" else "test")
