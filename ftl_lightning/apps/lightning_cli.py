@@ -260,6 +260,7 @@ def _command_line(kind: type[CommandLine], verb: str, arguments: Arguments, run:
             subclass_mode_model=True,
             subclass_mode_data=True,
             save_config_kwargs={"overwrite": True},
+            auto_configure_optimizers=False,  # modules configure their optimiser: model.learning_rate, model.weight_decay
             parser_kwargs={"parser_mode": "omegaconf+", "exit_on_error": False},
             run=run,
             args=[*([verb] if run else ()), *_null_in_groups(arguments).expanded(verb)],

@@ -7,7 +7,9 @@ figure or a message through :func:`line`.
 import html
 import io
 import json
+import os
 import re
+import stat
 import sys
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
@@ -42,8 +44,23 @@ def say(*parts: object, error: bool = False) -> None:
         print(*(plain(str(part)) for part in parts), file=sys.stderr if error else sys.stdout, flush=True)
 
 
+class _Pipe(io.FileIO):
+    """A pipe whose reader may end before the program, as ``head`` does; text without a reader is dropped."""
+
+    def write(self, content: Any) -> int | None:
+        try:
+            return super().write(content)
+        except BrokenPipeError:
+            return memoryview(content).nbytes
+
+
 def any_terminal() -> None:
-    """Let standard output replace characters that its encoding lacks, such as ± in ASCII, by question marks."""
+    """Let standard output replace characters that its encoding lacks, such as ± in ASCII, by question marks, and let a pipe end."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is getattr(sys, f"__{name}__") and stream is not None and stat.S_ISFIFO(os.fstat(stream.fileno()).st_mode):
+            pipe = io.BufferedWriter(_Pipe(stream.fileno(), "w", closefd=False))
+            setattr(sys, name, io.TextIOWrapper(pipe, stream.encoding, stream.errors, line_buffering=True))
     if isinstance(sys.stdout, io.TextIOWrapper):  # not a notebook's
         sys.stdout.reconfigure(errors="replace")
 

@@ -58,6 +58,8 @@ MOST_DEVICES, MOST_PROCESSES = 10_000, 256
 """Maximum number of devices or nodes, and of processes that learn concepts."""
 SHARES = ("limit_train_batches", "limit_val_batches", "limit_test_batches", "overfit_batches", "val_check_interval")
 """Options that are a share or a number, which Lightning does not check."""
+PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")
+"""Supported precisions: weights, data and learned concepts are float32."""
 _STARTS = ("`val_check_interval`", "Early stopping conditioned")
 """Beginnings of Lightning's messages about options."""
 _LOST = ("gloo", "NCCL", "Connection closed", "Connection reset", "Broken pipe", "TCPStore", "store->get")
@@ -130,6 +132,7 @@ class Trainer(pl.Trainer):
             raise UserError(f"trainer: {short(str(error), 200)}") from error
         if isinstance(self.accelerator, CPUAccelerator):
             check_range("trainer.devices", self.num_devices, 1, os.cpu_count() or 1)
+        require(self.precision in PRECISIONS, "trainer.precision", f"one of {', '.join(PRECISIONS)}", repr(self.precision))
         known = inspect.signature(pl.Trainer.__init__).parameters
         usual = {name: parameter.default for name, parameter in known.items()} | USUAL
         self.unusual = {
