@@ -26,6 +26,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -70,6 +71,16 @@ class FileSource:
         return known.take(torch.randint(len(known), (count,), generator=generator("cpu", seed)))
 
 
+@dataclass(frozen=True, repr=False)
+class OwnDomain(Domain):
+    """Domain of user data, which is pickled by the arguments of :func:`own_domain`."""
+
+    arguments: tuple[Any, ...] = ()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return own_domain, self.arguments
+
+
 def own_domain(
     examples: Demonstrations, training: Sequence[str], horizon: int, metrics: Mapping[str, float], source: FileSource | None = None
 ) -> Domain:
@@ -85,7 +96,7 @@ def own_domain(
     unknown = sorted(set(metrics) - set(METRICS))
     require(not unknown, "data.metrics", f"some of {', '.join(METRICS)}", ", ".join(unknown))
     source = source or FileSource(examples, torch.ones(len(examples), dtype=torch.bool))
-    return Domain(
+    return OwnDomain(
         name=OWN,
         plans=Plans(horizon, examples.state_names, examples.state_units),
         concepts=Concepts(training=tuple(training), reads=frozenset(examples.concepts).__contains__),
@@ -94,6 +105,7 @@ def own_domain(
         metrics={name: METRICS[name](examples, horizon, number) for name, number in metrics.items()},
         comparison=Comparison(headline=next(iter(metrics), ""), distance=partial(_distance, examples), fresh=False),
         recordings=Recordings(recorder=drawn_by_hand(examples, horizon)),
+        arguments=(examples, tuple(training), horizon, dict(metrics), source),
     )
 
 
