@@ -31,6 +31,10 @@ from ftl_lightning.training.checkpoint import last_checkpoint, read_checkpoint
 from ftl_lightning.training.trainer import Trainer, one_voice
 
 
+LOGS = Path("logs")
+"""Folder of the files of runs without a logger."""
+
+
 class CommandLine(LightningCLI):
     """Lightning's command line with the verb ``invert``."""
 
@@ -102,19 +106,29 @@ class CommandLine(LightningCLI):
 
     def before_instantiate_classes(self) -> None:
         """Claim a log folder that no concurrent run uses: a new folder for an inversion, ``invert``, then ``invert_1`` and so on. A
-        pretraining reuses the folder of an earlier run unless that is running. A run from a checkpoint uses the given folder.
+        pretraining reuses the folder of an earlier run unless that is running. A run from a checkpoint uses the given folder. A run
+        without a logger is given such a folder below ``logs``, since its files would be in the current folder.
         """
         if getattr(rank_zero_only, "rank", 0):  # the first process of a run claims the folder
             return
-        logger = self._get(self.config, "trainer").get("logger")
+        trainer = self._get(self.config, "trainer")
+        logger = trainer.get("logger")
+        if (logger in (False, []) or trainer.get("fast_dev_run")) and trainer.get("default_root_dir") is None:
+            trainer["default_root_dir"] = str(LOGS / self._claimed(LOGS, self._verb))
+            return
         options = logger.get("init_args") if isinstance(logger, Namespace) else None
         if not options or not isinstance(options.get("version"), str) or not {"save_dir", "name"} <= set(options.keys()):
             return
         folder, name = Path(options["save_dir"]) / (options["name"] or ""), options["version"]
+        options["version"] = self._claimed(folder, name)
+
+    def _claimed(self, folder: Path, name: str) -> str:
+        """Name of the log folder in a folder, claimed by verbs that learn."""
         if self._verb == "fit" and self._get(self.config, "ckpt_path"):
             log_folder.hold(folder / name)
         elif self._verb in ("fit", "invert"):
-            options["version"] = log_folder.claim(folder, name, new=self._verb == "invert")
+            return log_folder.claim(folder, name, new=self._verb == "invert")
+        return name
 
     def after_fit(self) -> None:
         """Print the folder of the model."""
