@@ -15,7 +15,7 @@ import lightning.pytorch as pl
 from jsonargparse import Namespace, set_parsing_settings
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.callbacks import ProgressBar
-from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
+from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
 from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import OmegaConf
 
@@ -29,7 +29,6 @@ from ftl_lightning.services.validation import check_range
 from ftl_lightning.training.board import TrainingBar, accuracies
 from ftl_lightning.training.checkpoint import last_checkpoint, read_checkpoint
 from ftl_lightning.training.trainer import Trainer, one_voice
-
 
 LOGS = Path("logs")
 """Folder of the files of runs without a logger."""
@@ -210,6 +209,17 @@ def _behind(error: BaseException) -> str:
     return str(error)
 
 
+class _SaveConfig(SaveConfigCallback):
+    """Write the configuration of a run once its checkpoint, if any, is accepted."""
+
+    def setup(self, trainer: pl.Trainer, pl_module: pl.LightningModule, stage: str) -> None:
+        if stage != "fit":
+            super().setup(trainer, pl_module, stage)
+
+    def on_fit_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        super().setup(trainer, pl_module, "fit")
+
+
 class _Parser(CommandLine):
     """Parse without building anything."""
 
@@ -273,6 +283,7 @@ def _command_line(kind: type[CommandLine], verb: str, arguments: Arguments, run:
             trainer_class=Trainer,
             subclass_mode_model=True,
             subclass_mode_data=True,
+            save_config_callback=_SaveConfig,
             save_config_kwargs={"overwrite": True},
             auto_configure_optimizers=False,  # modules configure their optimiser: model.learning_rate, model.weight_decay
             parser_kwargs={"parser_mode": "omegaconf+", "exit_on_error": False},

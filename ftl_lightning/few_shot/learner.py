@@ -56,6 +56,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+PLANS = 10
+"""Default number of sampled plans."""
 GIVEN = {
     "sample": ("count", "observed", "seed", "batch_size", "progress"),
     "execute": ("scenes", "goal", "replan", "environment", "seed"),
@@ -419,15 +421,13 @@ class FewShot(Shown):
             seed: seed of the initial states.
 
         Raises:
-            UserError: in domains without initial states.
+            UserError: in domains without initial states, or for an unknown task.
         """
         check_text("goal", goal, self.training_concepts[0])
         count, seed = check_whole("count", count, 1), check_whole("seed", seed, 0, None)
-        try:
-            states = self.domain.source(None).starts(goal, count, EVALUATION_SEED + seed)
-        except (KeyError, ValueError, IndexError):  # a source that does not check the text itself
+        if self.domain.observed and goal not in self.training_concepts:
             self.judging.check_goal(goal)
-            raise
+        states = self.domain.source(None).starts(goal, count, EVALUATION_SEED + seed)
         if states is None:
             raise UserError(f"starts: expected a domain with initial states, found {self.domain.name}")
         return states
@@ -436,7 +436,7 @@ class FewShot(Shown):
     def sample(
         self,
         concept: Composition,
-        count: int = 10,
+        count: int | None = None,
         observed: Start | None = None,
         *,
         seed: int = 0,
@@ -448,7 +448,7 @@ class FewShot(Shown):
 
         Args:
             concept: a learned or training concept, or a weighted sum of concepts.
-            count: number of plans; with initial states, a plan for each.
+            count: number of plans; ``None`` for a plan for each initial state, or 10 plans without initial states.
             observed: initial states, in domains with observed features.
             seed: seed of the noise.
             batch_size: maximum number of plans in a batch, to save memory; ``None`` for all. Plans are equal up to rounding.
@@ -459,12 +459,13 @@ class FewShot(Shown):
             Plans ``(sample, horizon, state)`` as demonstrations, with their initial states.
 
         Raises:
-            UserError: for a concept of another model, or a start that does not fit the model.
+            UserError: for a concept of another model, a start that does not fit the model, or another ``count`` than that of starts.
         """
         concept, sampling = self._own("sample", concept), self._sampling("sample", changes)
         starts = starts_of(self.domain, observed)
-        count = count if starts is None else len(starts)
-        count, seed = check_whole("count", count, 1), check_whole("seed", seed, 0, None)
+        wanted = PLANS if starts is None else len(starts)
+        count, seed = wanted if count is None else check_whole("count", count, 1), check_whole("seed", seed, 0, None)
+        require(starts is None or count == wanted, "count", f"{wanted} (a plan for each of the starts), or none", count)
         size = None if batch_size is None else check_whole("batch_size", batch_size, 1)
         seen = {} if starts is None else moved(starts.observed, self.device)
         states = sampled(self.model, concept, count, sampling, seed, seen, size, progress).cpu()

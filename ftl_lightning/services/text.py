@@ -12,11 +12,11 @@ import re
 import stat
 import sys
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
-from unicodedata import category
+from unicodedata import category, normalize
 
-from ftl_lightning.services.errors import LONGEST, short
+from ftl_lightning.services.errors import LONGEST, short, shown
 
 
 def plain(text: str) -> str:
@@ -27,6 +27,22 @@ def plain(text: str) -> str:
 def line(text: str) -> str:
     """:func:`plain` in a single line, with single spaces."""
     return plain(" ".join(text.split()))
+
+
+def folded(text: str) -> str:
+    """A text without differences by case, spaces or Unicode normal form, for comparison."""
+    return " ".join(normalize("NFKC", text).casefold().split())
+
+
+def alike(texts: Iterable[str]) -> Iterator[str]:
+    """A line for each two different ``texts`` that are equal once :func:`folded`."""
+    first: dict[str, str] = {}
+    for text in dict.fromkeys(texts):
+        before = first.setdefault(folded(text), text)
+        if before != text:
+            show: Callable[[str], str] = shown if shown(before) != shown(text) else lambda name: short(ascii(name))
+            pair = f"{show(before)} and {show(text)}"
+            yield f"{pair} are different concepts, but their names differ only by case, spaces or Unicode form; is one a slip?"
 
 
 _silent = False

@@ -23,6 +23,7 @@ from ftl_lightning.networks.text_encoder import Encoder, load_encoder
 from ftl_lightning.services.errors import UserError, require, short
 from ftl_lightning.services.modes import single_precision
 from ftl_lightning.services.randomness import DEMONSTRATION_SEED, drawn, generator, rows_of
+from ftl_lightning.services.text import alike, say
 from ftl_lightning.services.validation import LARGEST_STEP, MOST_TOGETHER, check_count, check_factor, check_range
 
 
@@ -276,6 +277,8 @@ class OwnData(PretrainingData):
         )
         self.save_hyperparameters()
         self.metrics = self._metrics
+        for note in alike(self.domain.concepts.training):
+            say(f"note: {note}", error=True)
 
     def _domain(self, name: str) -> tuple[str, Domain]:
         return OWN, domain_from_file(self._file, self._horizon, self._metrics, self._share)

@@ -172,6 +172,9 @@ class Trainer(pl.Trainer):
                     raise LostProcess(f"trainer.devices: {expected}; go on with --ckpt_path last") from error
                 raise
         _expect_monitors(self)
+        if self.ckpt_path and self.global_step == getattr(model, "resumed_from", None):
+            ended = f"the run had ended at step {self.global_step}, so nothing was learned; raise trainer.max_steps to go on"
+            say(f"note: ckpt_path: {ended}", error=True)
 
     @single_precision()
     def validate(self, *arguments: Any, **options: Any) -> Any:
