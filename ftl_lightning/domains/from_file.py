@@ -39,6 +39,7 @@ from ftl_lightning.domains.domain import Concepts, Domain, Metric, Plans, Record
 from ftl_lightning.domains.recognition import Recognition
 from ftl_lightning.domains.recorder import drawn_by_hand
 from ftl_lightning.services.errors import about, require, short
+from ftl_lightning.services.spectrum import check_cosines
 from ftl_lightning.services.randomness import generator
 
 OWN = "own"
@@ -69,6 +70,10 @@ class FileSource:
             return None
         known = self.split("validation", count, seed).initial_states
         return known.take(torch.randint(len(known), (count,), generator=generator("cpu", seed)))
+
+
+LONGEST_PLAN, WINDOW = 1024, 256
+"""Maximum length of demonstrations that are learned whole by default, and the default length of windows of longer ones."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -114,7 +119,8 @@ def domain_from_file(path: str, horizon: int | None, metrics: Mapping[str, float
 
     Args:
         path: the file, the folder of a LeRobot data set, or the name of an installed Minari data set.
-        horizon: states in a plan; ``None`` for the length of the longest demonstration.
+        horizon: states in a plan; ``None`` for the length of the longest demonstration, or :data:`WINDOW` if it is longer than
+            :data:`LONGEST_PLAN`.
         metrics: see :func:`own_domain`.
         share: share of each concept's demonstrations to hold out, at least one.
 
@@ -132,7 +138,7 @@ def domain_from_file(path: str, horizon: int | None, metrics: Mapping[str, float
         held_out[rows[-max(1, math.floor(share * len(rows))) :]] = True
     source = FileSource(demonstrations, held_out)
     longest = int(demonstrations.lengths.max())
-    return own_domain(source.split("validation", 0, 0), training, horizon or longest, metrics, source)
+    return own_domain(source.split("validation", 0, 0), training, horizon or (longest if longest <= LONGEST_PLAN else WINDOW), metrics, source)
 
 
 def read_own(path: str) -> Demonstrations:
@@ -189,6 +195,7 @@ def _distance(examples: Demonstrations, states: Tensor, others: Tensor) -> Tenso
 
 def _recognised(examples: Demonstrations, horizon: int, number: float) -> Metric:
     require(0 < number <= 1, "data.metrics.recognised", "a share of real demonstrations above 0, at most 1", f"{number:g}")
+    check_cosines(horizon, "the metric recognised")
     known = cache(lambda: Recognition(examples, horizon, number))  # fitted on first use
 
     def measure(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:

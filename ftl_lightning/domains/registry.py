@@ -92,7 +92,7 @@ def _by_reference(domain: Domain) -> tuple[Callable[[str], Domain], tuple[str]]:
             if value is domain:
                 return load_domain, (f"{module.__name__}:{name}",)
     raise UserError(
-        f"pickle: expected a domain that a module holds, such as my_domain:DOMAIN, found {short(domain.name)!r} of none"
+        f"pickle: expected a domain of a module, such as my_domain:DOMAIN, found {short(domain.name)!r} of none"
     )
 
 

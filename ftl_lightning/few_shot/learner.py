@@ -459,7 +459,7 @@ class FewShot(Shown):
             Plans ``(sample, horizon, state)`` as demonstrations, with their initial states.
 
         Raises:
-            UserError: for a concept of another model, a start that does not fit the model, or another ``count`` than that of starts.
+            UserError: for a concept of another model, a start that does not fit, or another ``count`` than that of starts.
         """
         concept, sampling = self._own("sample", concept), self._sampling("sample", changes)
         starts = starts_of(self.domain, observed)

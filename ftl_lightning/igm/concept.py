@@ -1,6 +1,5 @@
 """A learned concept and its file."""
 
-import re
 import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, fields, replace
@@ -330,10 +329,10 @@ LONGEST_NAME = 200
 def file_name(concept: str) -> str:
     """File name of a concept: letters, digits and dots are kept, all else becomes underscores.
 
-    The first letter is no dot, and a long name is cut and marked by its hash.
+    Leading dots are left out, and a long name is cut and marked by its hash.
     """
     name = "".join(letter if letter.isalnum() or letter == "." else "_" for letter in concept)
-    name = re.sub(r"^\.+", lambda dots: "_" * len(dots[0]), name) or "_"
+    name = name.lstrip(".") or "concept"
     if len(name.encode()) <= LONGEST_NAME:
         return name
     return f"{name.encode()[: LONGEST_NAME - 9].decode(errors='ignore')}_{zlib.crc32(concept.encode(errors='replace')):08x}"

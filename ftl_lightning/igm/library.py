@@ -261,7 +261,7 @@ def concept_files(names: Iterable[str], folder: Path, place: str) -> dict[str, P
     files: dict[str, Path] = {}
     taken: set[str] = set()
     for name in dict.fromkeys(names):
-        stems = (f"{file_name(name)}{f'_{number}' if number > 1 else ''}" for number in itertools.count(1))
+        stems = (f"{file_name(name)}{f'_{number}' if number else ''}" for number in itertools.count())
         stem = next(stem for stem in stems if folded(stem) not in taken)
         taken.add(folded(stem))
         files[name] = folder / f"{stem}.safetensors"

@@ -234,7 +234,8 @@ class PretrainingData(pl.LightningDataModule):
 class OwnData(PretrainingData):
     """Batches of user demonstrations; the file, with a concept text per demonstration, defines the domain.
 
-    Plans have the length of the longest demonstration unless ``horizon`` is given.
+    Plans have the length of the longest demonstration unless ``horizon`` is given, or demonstrations are longer than
+    :data:`~ftl_lightning.domains.from_file.LONGEST_PLAN`.
 
     Args:
         demonstrations: the file (``.npz`` or safetensors), see
@@ -277,6 +278,9 @@ class OwnData(PretrainingData):
         )
         self.save_hyperparameters()
         self.metrics = self._metrics
+        if horizon is None and self.horizon < (longest := int(self.domain.source(None).demonstrations.lengths.max())):
+            note = f"demonstrations have up to {longest} steps, so plans are windows of {self.horizon}"
+            say(f"note: data.horizon: {note}; --data.horizon N makes them longer or shorter", error=True)
         for note in alike(self.domain.concepts.training):
             say(f"note: {note}", error=True)
 
