@@ -39,8 +39,8 @@ from ftl_lightning.domains.domain import Concepts, Domain, Metric, Plans, Record
 from ftl_lightning.domains.recognition import Recognition
 from ftl_lightning.domains.recorder import drawn_by_hand
 from ftl_lightning.services.errors import about, require, short
-from ftl_lightning.services.spectrum import check_cosines
 from ftl_lightning.services.randomness import generator
+from ftl_lightning.services.spectrum import check_cosines
 
 OWN = "own"
 """Name of the domain of user data."""
@@ -138,7 +138,8 @@ def domain_from_file(path: str, horizon: int | None, metrics: Mapping[str, float
         held_out[rows[-max(1, math.floor(share * len(rows))) :]] = True
     source = FileSource(demonstrations, held_out)
     longest = int(demonstrations.lengths.max())
-    return own_domain(source.split("validation", 0, 0), training, horizon or (longest if longest <= LONGEST_PLAN else WINDOW), metrics, source)
+    usual = longest if longest <= LONGEST_PLAN else WINDOW
+    return own_domain(source.split("validation", 0, 0), training, horizon or usual, metrics, source)
 
 
 def read_own(path: str) -> Demonstrations:

@@ -91,9 +91,7 @@ def _by_reference(domain: Domain) -> tuple[Callable[[str], Domain], tuple[str]]:
         for name, value in list(getattr(module, "__dict__", {}).items()):
             if value is domain:
                 return load_domain, (f"{module.__name__}:{name}",)
-    raise UserError(
-        f"pickle: expected a domain of a module, such as my_domain:DOMAIN, found {short(domain.name)!r} of none"
-    )
+    raise UserError(f"pickle: expected a domain of a module, such as my_domain:DOMAIN, found {short(domain.name)!r} of none")
 
 
 copyreg.pickle(Domain, _by_reference)  # type: ignore[arg-type]

@@ -17,7 +17,7 @@ from torch.utils.data import DataLoader, IterableDataset
 from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.data.features import check_features
 from ftl_lightning.domains.domain import Domain, Recoveries
-from ftl_lightning.domains.from_file import OWN, domain_from_file, read_demonstrations, read_own
+from ftl_lightning.domains.from_file import OWN, FileSource, domain_from_file, read_demonstrations, read_own
 from ftl_lightning.domains.registry import load_domain, recorded_name
 from ftl_lightning.networks.text_encoder import Encoder, load_encoder
 from ftl_lightning.services.errors import UserError, require, short
@@ -278,7 +278,9 @@ class OwnData(PretrainingData):
         )
         self.save_hyperparameters()
         self.metrics = self._metrics
-        if horizon is None and self.horizon < (longest := int(self.domain.source(None).demonstrations.lengths.max())):
+        source = self.domain.source(None)
+        assert isinstance(source, FileSource)
+        if horizon is None and self.horizon < (longest := int(source.demonstrations.lengths.max())):
             note = f"demonstrations have up to {longest} steps, so plans are windows of {self.horizon}"
             say(f"note: data.horizon: {note}; --data.horizon N makes them longer or shorter", error=True)
         for note in alike(self.domain.concepts.training):
