@@ -40,7 +40,8 @@ def alike(texts: Iterable[str]) -> Iterator[str]:
     for text in dict.fromkeys(texts):
         before = first.setdefault(folded(text), text)
         if before != text:
-            show: Callable[[str], str] = shown if shown(before) != shown(text) else lambda name: short(ascii(name))
+            letters = normalize("NFC", before) != normalize("NFC", text)
+            show: Callable[[str], str] = shown if letters else lambda name: short(ascii(name))
             pair = f"{show(before)} and {show(text)}"
             yield f"{pair} are different concepts, but their names differ only by case, spaces or Unicode form; is one a slip?"
 

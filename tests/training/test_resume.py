@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from ftl_lightning.cli.main import main
-from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.errors import LONGEST, UserError
 from ftl_lightning.training.checkpoint import WholeCheckpoints, apply_rates, read_checkpoint
 from tests import tiny as sizes
-from tests.conftest import CONF, refused, succeed
+from tests.conftest import CONF, succeed
 
 RUN = ["--data.batch_size=8", "--data.steps_per_epoch=3", "--trainer.max_steps=7"]
 RUN += ["--evaluation.samples=1", "--evaluation.figures=0"]
@@ -66,16 +66,27 @@ def strokes() -> tuple[np.ndarray, np.ndarray]:
         return file["states"], file["concepts"]
 
 
+def stopped(arguments: list[str], capsys: Told, *expected: str) -> None:
+    """One line with these texts, and what the run has written stays; Lightning has begun another log."""
+    capsys.readouterr()
+    before = {path: path.read_bytes() for path in Path("logs").rglob("*") if path.is_file()}
+    assert main(arguments) == 2
+    (error,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
+    assert all(text in error for text in expected), error
+    assert len(error) <= LONGEST
+    assert before == {path: path.read_bytes() for path in before}
+
+
 @pytest.mark.slow
 def test_a_run_does_not_go_on_with_other_data(fit: list[str], capsys: Told) -> None:
     states, texts = strokes()
     others = "ckpt_path: expected the training data of the checkpoint (hash "
-    refused(capsys, [*fit, *FURTHER, changed(states=3 * states)], others, "start anew without --ckpt_path")
-    refused(capsys, [*fit, *FURTHER, changed(states=states[::-1])], others)
-    refused(capsys, [*fit, *FURTHER, "--data.validation_share=0.6"], others, "data.validation_share 0.6 (before: 0.1)")
-    refused(capsys, [*fit, *FURTHER, changed(concepts=np.char.add(texts, " 2"))], "ckpt_path: key 'training_concepts': expected")
-    refused(capsys, [*fit, *FURTHER, changed(state_names=["a", "b"])], "ckpt_path: key 'columns': expected", "'a', 'b'")
-    refused(capsys, [*fit, *FURTHER, changed(state_units=["ft", "ft"])], "ckpt_path: key 'units': expected", "'ft', 'ft'")
+    stopped([*fit, *FURTHER, changed(states=3 * states)], capsys, others, "start anew without --ckpt_path")
+    stopped([*fit, *FURTHER, changed(states=states[::-1])], capsys, others)
+    stopped([*fit, *FURTHER, "--data.validation_share=0.6"], capsys, others, "data.validation_share 0.6 (before: 0.1)")
+    stopped([*fit, *FURTHER, changed(concepts=np.char.add(texts, " 2"))], capsys, "ckpt_path: key 'training_concepts': expected")
+    stopped([*fit, *FURTHER, changed(state_names=["a", "b"])], capsys, "ckpt_path: key 'columns': expected", "'a', 'b'")
+    stopped([*fit, *FURTHER, changed(state_units=["ft", "ft"])], capsys, "ckpt_path: key 'units': expected", "'ft', 'ft'")
     assert main([*fit, *FURTHER, changed()]) == 0  # the same content in another file
     assert "ckpt_path" not in capsys.readouterr().err
 
