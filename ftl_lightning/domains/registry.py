@@ -94,4 +94,4 @@ def _by_reference(domain: Domain) -> tuple[Callable[[str], Domain], tuple[str]]:
     raise UserError(f"pickle: expected a domain of a module, such as my_domain:DOMAIN, found {short(domain.name)!r} of none")
 
 
-copyreg.pickle(Domain, _by_reference)  # type: ignore[arg-type]
+copyreg.pickle(Domain, _by_reference)

@@ -64,7 +64,7 @@ def say(*parts: object, error: bool = False) -> None:
 class _Pipe(io.FileIO):
     """A pipe whose reader may end before the program, as ``head`` does; text without a reader is dropped."""
 
-    def write(self, content: Any) -> int | None:
+    def write(self, content: Any) -> int:
         try:
             return super().write(content)
         except BrokenPipeError:
