@@ -114,6 +114,7 @@ def sampled(model: FewShot, concept: LearnedConcept, mixed: Composition) -> list
     return [model.sample(one, 2, steps=2).states.numpy() for one in (concept, mixed)]
 
 
+@pytest.mark.slow
 def test_a_model_its_concepts_and_compositions_go_to_another_process() -> None:
     model = FewShot.from_pretrained("strokes")
     learned = model.learn(FIVE, steps=2, form="paper")
