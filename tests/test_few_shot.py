@@ -209,8 +209,14 @@ def test_plans_start_where_they_are_told_to(drives: FewShot) -> None:
     starts = drives.starts("go to bowl", 3, seed=5)
     assert torch.equal(starts.require_scenes(), drives.starts("go to bowl", 3, seed=5).require_scenes())
     world, concept = starts.observed[OBSERVED], drives["go to bowl"]
-    plans = drives.sample(concept, 99, starts, **QUICK)
+    plans = drives.sample(concept, observed=starts, **QUICK)
     assert plans.states.shape == (3, 128, 13)  # one from each start
+    assert torch.equal(drives.sample(concept, 3, starts, **QUICK).states, plans.states)
+    with pytest.raises(UserError, match=r"count: expected 3 \(a plan for each of the starts\), or none, found 99"):
+        drives.sample(concept, 99, starts, **QUICK)
+    for goal in ("go to nowhere", "Go to bowl", ""):
+        with pytest.raises(UserError, match=r"goal: expected a task of driving, such as "):
+            drives.starts(goal)
     assert torch.equal(plans.initial_states.observed[OBSERVED], world)
     for observed in (world, world.numpy(), world.tolist(), {OBSERVED: world.numpy()}, InitialStates({OBSERVED: world})):
         assert torch.equal(drives.sample(concept, observed=observed, **QUICK).states, plans.states)

@@ -15,7 +15,7 @@ import lightning.pytorch as pl
 from jsonargparse import Namespace, set_parsing_settings
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.callbacks import ProgressBar
-from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
+from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
 from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import OmegaConf
 
@@ -29,6 +29,9 @@ from ftl_lightning.services.validation import check_range
 from ftl_lightning.training.board import TrainingBar, accuracies
 from ftl_lightning.training.checkpoint import last_checkpoint, read_checkpoint
 from ftl_lightning.training.trainer import Trainer, one_voice
+
+LOGS = Path("logs")
+"""Folder of the files of runs without a logger."""
 
 
 class CommandLine(LightningCLI):
@@ -102,19 +105,29 @@ class CommandLine(LightningCLI):
 
     def before_instantiate_classes(self) -> None:
         """Claim a log folder that no concurrent run uses: a new folder for an inversion, ``invert``, then ``invert_1`` and so on. A
-        pretraining reuses the folder of an earlier run unless that is running. A run from a checkpoint uses the given folder.
+        pretraining reuses the folder of an earlier run unless that is running. A run from a checkpoint uses the given folder. A run
+        without a logger is given such a folder below ``logs``, since its files would be in the current folder.
         """
         if getattr(rank_zero_only, "rank", 0):  # the first process of a run claims the folder
             return
-        logger = self._get(self.config, "trainer").get("logger")
+        trainer = self._get(self.config, "trainer")
+        logger = trainer.get("logger")
+        if (logger in (False, []) or trainer.get("fast_dev_run")) and trainer.get("default_root_dir") is None:
+            trainer["default_root_dir"] = str(LOGS / self._claimed(LOGS, self._verb))
+            return
         options = logger.get("init_args") if isinstance(logger, Namespace) else None
         if not options or not isinstance(options.get("version"), str) or not {"save_dir", "name"} <= set(options.keys()):
             return
         folder, name = Path(options["save_dir"]) / (options["name"] or ""), options["version"]
+        options["version"] = self._claimed(folder, name)
+
+    def _claimed(self, folder: Path, name: str) -> str:
+        """Name of the log folder in a folder, claimed by verbs that learn."""
         if self._verb == "fit" and self._get(self.config, "ckpt_path"):
             log_folder.hold(folder / name)
         elif self._verb in ("fit", "invert"):
-            options["version"] = log_folder.claim(folder, name, new=self._verb == "invert")
+            return log_folder.claim(folder, name, new=self._verb == "invert")
+        return name
 
     def after_fit(self) -> None:
         """Print the folder of the model."""
@@ -196,6 +209,17 @@ def _behind(error: BaseException) -> str:
     return str(error)
 
 
+class _SaveConfig(SaveConfigCallback):
+    """Write the configuration of a run once its checkpoint, if any, is accepted."""
+
+    def setup(self, trainer: pl.Trainer, pl_module: pl.LightningModule, stage: str) -> None:
+        if stage != "fit":
+            super().setup(trainer, pl_module, stage)
+
+    def on_fit_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        super().setup(trainer, pl_module, "fit")
+
+
 class _Parser(CommandLine):
     """Parse without building anything."""
 
@@ -259,7 +283,9 @@ def _command_line(kind: type[CommandLine], verb: str, arguments: Arguments, run:
             trainer_class=Trainer,
             subclass_mode_model=True,
             subclass_mode_data=True,
+            save_config_callback=_SaveConfig,
             save_config_kwargs={"overwrite": True},
+            auto_configure_optimizers=False,  # modules configure their optimiser: model.learning_rate, model.weight_decay
             parser_kwargs={"parser_mode": "omegaconf+", "exit_on_error": False},
             run=run,
             args=[*([verb] if run else ()), *_null_in_groups(arguments).expanded(verb)],

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ftl_lightning.services.errors import UserError, about, require
-from ftl_lightning.services.text import line, say
+from ftl_lightning.services.errors import UserError, about, note, require
+from ftl_lightning.services.text import alike, line, say
 from ftl_lightning.services.validation import check_count, check_range
 
 if TYPE_CHECKING:
@@ -134,6 +134,8 @@ def check(options: CheckOptions) -> None:
     if model is not None:
         with about(options.file):
             demonstrations = model.demonstrations(demonstrations, name=Path(options.file).stem)
+    for text in alike(demonstrations.concepts):
+        note(text)
     checks = []
     for text in dict.fromkeys(demonstrations.concepts):
         rows = [row for row, concept in enumerate(demonstrations.concepts) if concept == text]

@@ -6,7 +6,7 @@ import sys
 import warnings
 from argparse import ArgumentError
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -123,7 +123,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # Never unpickle, whatever a library's default is.
     os.environ["TORCH_FORCE_WEIGHTS_ONLY_LOAD"] = "1"
     try:
-        with trust.person(verb, read) as rest, _notes():
+        with trust.person(verb, read) as rest, _notes(), _modes():
             _dispatch(verb, rest)
     except UserError as error:
         return _refused(str(error))
@@ -160,6 +160,15 @@ def _notes() -> Iterator[None]:
 
         warnings.showwarning = show
         yield
+
+
+def _modes() -> AbstractContextManager[None]:
+    """The usual modes of torch, which a program that calls :func:`main` may have changed; torch is not imported for this."""
+    if "torch" not in sys.modules:
+        return nullcontext()
+    from ftl_lightning.services.modes import usual_modes
+
+    return usual_modes()
 
 
 def _refused(message: str) -> int:

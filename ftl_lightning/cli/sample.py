@@ -90,7 +90,7 @@ def sample(options: SampleOptions) -> None:
     goal, film = options.goal, model.domain.show.film
     starts = _sample_starts(options, model.domain)
     exported = _export_files(options.export, options.count if starts is None else len(starts))
-    plans = model.sample(composition, options.count, starts, seed=options.seed, **_sampling(options))
+    plans = model.sample(composition, options.count if starts is None else None, starts, seed=options.seed, **_sampling(options))
     provenance = {**plans.provenance, "concept": options.concept, "compose": options.compose}
     plans = replace(plans, concepts=(goal,) * len(plans), provenance=provenance)
     plans.save(options.out)

@@ -8,7 +8,7 @@ import importlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, Self, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -290,6 +290,9 @@ class Domain(Shown):
     closed_loop: ClosedLoop | None = None
     comparison: Comparison = field(default_factory=Comparison)
     recordings: Recordings = field(default_factory=Recordings)
+
+    def __deepcopy__(self, memo: object) -> Self:
+        return self  # immutable
 
     def __post_init__(self) -> None:
         if self.show is _DERIVED:

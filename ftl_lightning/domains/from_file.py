@@ -26,6 +26,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -41,6 +42,7 @@ from ftl_lightning.domains.recognition import Recognition
 from ftl_lightning.domains.recorder import drawn_by_hand
 from ftl_lightning.services.errors import about, note, require
 from ftl_lightning.services.randomness import generator
+from ftl_lightning.services.spectrum import check_cosines
 
 CONTINUOUS = "continuous"
 """View of data with columns that are not linear."""
@@ -70,6 +72,20 @@ class FileSource:
             return None
         starts = self.split("validation", count, seed).initial_states
         return starts.take(torch.randint(len(starts), (count,), generator=generator("cpu", seed)))
+
+
+LONGEST_PLAN, WINDOW = 1024, 256
+"""Maximum length of demonstrations that are learned whole by default, and the default length of windows of longer ones."""
+
+
+@dataclass(frozen=True, repr=False)
+class OwnDomain(Domain):
+    """Domain of user data, which is pickled by the arguments of :func:`own_domain`."""
+
+    arguments: tuple[Any, ...] = ()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return own_domain, self.arguments
 
 
 def own_domain(
@@ -110,7 +126,7 @@ def own_domain(
     def distance(states: Tensor, others: Tensor) -> Tensor:
         return _distance(judged, convert(states), convert(others))
 
-    return Domain(
+    return OwnDomain(
         name=OWN,
         plans=Plans(
             horizon,
@@ -125,6 +141,7 @@ def own_domain(
         metrics={name: metric(name, number) for name, number in metrics.items()},
         comparison=Comparison(headline=next(iter(metrics), ""), distance=distance, fresh=False),
         recordings=Recordings(recorder=drawn_by_hand(examples, horizon)),
+        arguments=(examples, tuple(training), horizon, dict(metrics), source),
     )
 
 
@@ -144,7 +161,8 @@ def domain_from_file(
 
     Args:
         path: the file, the folder of a LeRobot data set, or the name of an installed Minari data set.
-        horizon: states in a plan; ``None`` for the length of the longest demonstration.
+        horizon: states in a plan; ``None`` for the length of the longest demonstration, or :data:`WINDOW` if it is longer than
+            :data:`LONGEST_PLAN`.
         metrics: see :func:`own_domain`.
         share: share of each concept's demonstrations to hold out, at least a single demonstration.
         kinds: kinds of columns by name, see :func:`~ftl_lightning.data.kinds.declared`.
@@ -165,7 +183,8 @@ def domain_from_file(
         held_out[rows[-max(1, math.floor(share * len(rows))) :]] = True
     source = FileSource(demonstrations, held_out)
     longest = int(demonstrations.lengths.max())
-    return own_domain(source.split("validation", 0, 0), training, horizon or longest, metrics, source)
+    usual = longest if longest <= LONGEST_PLAN else WINDOW
+    return own_domain(source.split("validation", 0, 0), training, horizon or usual, metrics, source)
 
 
 def read_own(path: str) -> Demonstrations:
@@ -233,6 +252,7 @@ def _distance(examples: Demonstrations, states: Tensor, others: Tensor) -> Tenso
 
 def _recognised(examples: Demonstrations, horizon: int, number: float) -> Metric:
     require(0 < number <= 1, "data.metrics.recognised", "a share of real demonstrations above 0, at most 1", f"{number:g}")
+    check_cosines(horizon, "the metric recognised")
     recognition = cache(lambda: Recognition(examples, horizon, number))  # fitted on first use
 
     def measure(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:

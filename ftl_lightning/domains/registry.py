@@ -1,7 +1,10 @@
 """Registry of domains: by entry-point name from installed packages, or by module."""
 
+import copyreg
 import functools
 import importlib
+import sys
+from collections.abc import Callable
 
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.services.errors import UserError, require, short
@@ -78,3 +81,17 @@ def recorded_name(name: str) -> str:
     domain = load_domain(name)
     offered = (known for known in domain_names() if known == name or (known == domain.name and load_domain(known) is domain))
     return next(offered, name)
+
+
+def _by_reference(domain: Domain) -> tuple[Callable[[str], Domain], tuple[str]]:
+    """Pickle a domain, which holds functions, by the name under which another process imports it."""
+    if domain.name in _offered() and load_domain(domain.name) is domain:
+        return load_domain, (domain.name,)
+    for module in list(sys.modules.values()):
+        for name, value in list(getattr(module, "__dict__", {}).items()):
+            if value is domain:
+                return load_domain, (f"{module.__name__}:{name}",)
+    raise UserError(f"pickle: expected a domain of a module, such as my_domain:DOMAIN, found {short(domain.name)!r} of none")
+
+
+copyreg.pickle(Domain, _by_reference)

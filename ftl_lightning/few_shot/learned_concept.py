@@ -14,6 +14,7 @@ from ftl_lightning.igm.concept import Concept
 from ftl_lightning.igm.explanation import Explanation, explain
 from ftl_lightning.igm.library import kept_file
 from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.modes import usual_modes
 from ftl_lightning.services.validation import check_whole
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.hub import upload
@@ -70,12 +71,14 @@ class LearnedConcept(Composition):
         return self.inspection
 
     @functools.cached_property
+    @usual_modes()
     def inspection(self) -> Inspection | None:
         """:attr:`quality`; ``None`` where it cannot be measured."""
         if self.demonstrations is None or self.judging is None:
             return None
         return inspected(self.model, self.judging, self.demonstrations, self.concept)
 
+    @usual_modes()
     def explain(self, nearest: int = 3) -> Explanation:
         """Explain the weighted sum, averaged over knots, by training concepts.
 

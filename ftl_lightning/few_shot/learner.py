@@ -39,6 +39,7 @@ from ftl_lightning.igm.library import Library, library
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.igm.settings import INVERSION
 from ftl_lightning.services.errors import UserError, require, short, shown
+from ftl_lightning.services.modes import usual_modes
 from ftl_lightning.services.progress import bar
 from ftl_lightning.services.randomness import EVALUATION_SEED
 from ftl_lightning.services.shipped import pretrained_folder, shipped_models, shipped_name
@@ -55,6 +56,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+PLANS = 10
+"""Default number of sampled plans."""
 GIVEN = {
     "sample": ("count", "observed", "seed", "batch_size", "progress"),
     "execute": ("scenes", "goal", "replan", "environment", "seed"),
@@ -83,6 +86,7 @@ class FewShot(Shown):
         self._examples: list[Demonstrations] = [] if model.examples is None else [model.examples]
 
     @classmethod
+    @usual_modes()
     def from_pretrained(
         cls, name: str | Path, settings: str | Path | None = None, device: str = "cpu", domain: Domain | str | None = None
     ) -> Self:
@@ -122,6 +126,7 @@ class FewShot(Shown):
         """The model's device."""
         return self.model.device
 
+    @usual_modes()
     def to(self, device: str | torch.device) -> Self:
         """Move the model to another device; existing concepts follow when they are used.
 
@@ -149,6 +154,7 @@ class FewShot(Shown):
         """Texts that ``model[text]`` accepts."""
         return self.model.config.training_concepts
 
+    @usual_modes()
     def __getitem__(self, text: str) -> Composition:
         """A training concept, with weight 1.
 
@@ -170,6 +176,7 @@ class FewShot(Shown):
             check_path("folder", folder, "a folder of learned concepts")
         return library(self.model.hash, self.training_concepts, self.folder, folders)
 
+    @usual_modes()
     def load(self, path: str | Path) -> LearnedConcept:
         """Load a learned concept from its file, a folder of ``save_pretrained``, or ``'owner/name'`` on the Hugging Face Hub.
 
@@ -191,6 +198,7 @@ class FewShot(Shown):
         check_concept(self.model, concept, path)
         return self._learned(concept)
 
+    @usual_modes()
     def compose(self, text: str) -> Composition:
         """Compose training and learned concepts with weights: ``'go to red object:1.2 + other.safetensors:0.9'``.
 
@@ -257,6 +265,7 @@ class FewShot(Shown):
             )
         return concept if concept.weights.device == self.device else concept.to(self.device)
 
+    @usual_modes()
     def demonstrations(
         self,
         states: ArrayLike | Sequence[ArrayLike] | Demonstrations,
@@ -277,6 +286,7 @@ class FewShot(Shown):
         check_text("name", name, "go to red bowl")
         return demonstrations_of(self.domain, states, observed, name)
 
+    @usual_modes()
     def learn(
         self,
         states: ArrayLike | Sequence[ArrayLike] | Demonstrations,
@@ -311,6 +321,7 @@ class FewShot(Shown):
         (learned,) = self._learn(fitted, "learn", steps, seed, progress, watch, changes)
         return learned
 
+    @usual_modes()
     def learn_all(
         self, demonstrations: Demonstrations, *, steps: int | None = None, seed: int = 0, progress: bool = False, **changes: Any
     ) -> dict[str, LearnedConcept]:
@@ -349,7 +360,10 @@ class FewShot(Shown):
         watch: Callable[[Learning], None] | None,
         changes: Mapping[str, Any],
     ) -> list[LearnedConcept]:
-        """Learn the concepts of fitted demonstrations, in order, for a public method called by the user (``stacklevel`` 3)."""
+        """Learn the concepts of fitted demonstrations, in order, for a public method called by the user.
+
+        Its ``stacklevel`` is 4, with the decorator of the method.
+        """
         names = tuple(dict.fromkeys(fitted.concepts))
         title = f"learning {names[0]!r}" if len(names) == 1 else f"learning {len(names)} concepts"
         check_whole("seed", seed, 0, None)
@@ -361,7 +375,7 @@ class FewShot(Shown):
         require(descends, "learn", f"no settings of an inversion, as {method} learns without gradient descent", str(given))
         total = self.tuned.learning_steps if steps is None else check_whole("steps", steps, 1, LARGEST_STEP)
         for note in notes_of(self.model, fitted):
-            warnings.warn(note, stacklevel=3)
+            warnings.warn(note, stacklevel=4)
         watched = None if watch is None else self._watched(names[0], watch)
         with bar(title, total) if progress else nullcontext(lambda *_: None) as advance:
             learned = self.model.learn_concepts(fitted, settings, total, lambda loss: advance(1, f"loss {loss:.3g}"), watched)
@@ -372,6 +386,7 @@ class FewShot(Shown):
     def _watched(self, name: str, watch: Callable[[Learning], None]) -> Watch:
         return lambda step, loss, concepts: watch(Learning(step, loss, lambda: self._learned(concepts()[name])))
 
+    @usual_modes()
     def check(
         self,
         states: ArrayLike | Sequence[ArrayLike] | Demonstrations,
@@ -395,6 +410,7 @@ class FewShot(Shown):
         fitted = of_one_concept(self.demonstrations(whole, observed, name))
         return check_with(self.model, fitted, self.tuned.inversion, self.tuned.learning_steps if learn else 0, findings, progress)
 
+    @usual_modes()
     def starts(self, goal: str, count: int = 10, seed: int = 0) -> InitialStates:
         """Draw new initial states of a task, with scenes in domains with an environment.
 
@@ -404,23 +420,22 @@ class FewShot(Shown):
             seed: seed of the initial states.
 
         Raises:
-            UserError: in domains without initial states.
+            UserError: in domains without initial states, or for an unknown task.
         """
         check_text("goal", goal, self.training_concepts[0])
         count, seed = check_whole("count", count, 1), check_whole("seed", seed, 0, None)
-        try:
-            states = self.domain.source(None).starts(goal, count, EVALUATION_SEED + seed)
-        except (KeyError, ValueError, IndexError):  # a source that does not check the text itself
+        if self.domain.observed and goal not in self.training_concepts:
             self.judging.check_goal(goal)
-            raise
+        states = self.domain.source(None).starts(goal, count, EVALUATION_SEED + seed)
         if states is None:
             raise UserError(f"starts: expected a domain with initial states, found {self.domain.name}")
         return states
 
+    @usual_modes()
     def sample(
         self,
         concept: Composition,
-        count: int = 10,
+        count: int | None = None,
         observed: Start | None = None,
         *,
         seed: int = 0,
@@ -432,7 +447,7 @@ class FewShot(Shown):
 
         Args:
             concept: a learned or training concept, or a weighted sum of concepts.
-            count: number of plans; with initial states, a plan for each.
+            count: number of plans; ``None`` for a plan for each initial state, or 10 plans without initial states.
             observed: initial states, in domains with observed features.
             seed: seed of the noise.
             batch_size: maximum number of plans in a batch, to save memory; ``None`` for all. Plans are equal up to rounding.
@@ -443,12 +458,13 @@ class FewShot(Shown):
             Plans ``(sample, horizon, state)`` as demonstrations, with their initial states.
 
         Raises:
-            UserError: for a concept of another model, or a start that does not fit the model.
+            UserError: for a concept of another model, a start that does not fit, or another ``count`` than that of starts.
         """
         concept, sampling = self._own("sample", concept), self._sampling("sample", changes)
         starts = starts_of(self.domain, observed)
-        count = count if starts is None else len(starts)
-        count, seed = check_whole("count", count, 1), check_whole("seed", seed, 0, None)
+        wanted = PLANS if starts is None else len(starts)
+        count, seed = wanted if count is None else check_whole("count", count, 1), check_whole("seed", seed, 0, None)
+        require(starts is None or count == wanted, "count", f"{wanted} (a plan for each of the starts), or none", count)
         size = None if batch_size is None else check_whole("batch_size", batch_size, 1)
         seen = {} if starts is None else moved(starts.observed, self.device)
         states = sampled(self.model, concept, count, sampling, seed, seen, size, progress).cpu()
@@ -461,6 +477,7 @@ class FewShot(Shown):
             raise UserError(f"steps: expected 1 to {self.model.max_steps} (the model's T), found {sampling.steps}")
         return sampling
 
+    @usual_modes()
     def evaluate(self, plans: Demonstrations, goal: str) -> dict[str, float]:
         """Evaluate plans by the domain's metrics: success rates or means by name.
 
@@ -475,11 +492,13 @@ class FewShot(Shown):
         """Domain that judges generated behaviour: the model's; for a user's data, including demonstrations of learned concepts."""
         return judging_domain(self.model, self._examples)
 
+    @usual_modes()
     def render(self, plans: Demonstrations, goal: str = "") -> "Figure":
         """Draw plans; with a goal, right plans are framed green and wrong plans red."""
         check_of_domain("render", plans, self.domain)
         return picture(self.judging, plans, goal)
 
+    @usual_modes()
     def execute(
         self,
         concept: Composition,

@@ -1,5 +1,6 @@
 """A learned concept and its file."""
 
+import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -321,9 +322,20 @@ class Concept(Shown):
             return concept
 
 
+LONGEST_NAME = 200
+"""Maximum bytes of a file name without its ending."""
+
+
 def file_name(concept: str) -> str:
-    """File name of a concept: letters, digits and dots are kept, all else becomes underscores."""
-    return "".join(letter if letter.isalnum() or letter == "." else "_" for letter in concept)
+    """File name of a concept: letters, digits and dots are kept, all else becomes underscores.
+
+    Leading dots are left out, and a long name is cut and marked by its hash.
+    """
+    name = "".join(letter if letter.isalnum() or letter == "." else "_" for letter in concept)
+    name = name.lstrip(".") or "concept"
+    if len(name.encode()) <= LONGEST_NAME:
+        return name
+    return f"{name.encode()[: LONGEST_NAME - 9].decode(errors='ignore')}_{zlib.crc32(concept.encode(errors='replace')):08x}"
 
 
 def _expect_shapes(tensors: Mapping[str, Tensor]) -> None:

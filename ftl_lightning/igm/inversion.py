@@ -28,6 +28,7 @@ from ftl_lightning.igm.model import Invertible
 from ftl_lightning.igm.optimizer import Adam
 from ftl_lightning.igm.settings import CONCEPTS, EXPLAINED, REDUCED, InversionSettings
 from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.modes import usual_modes
 from ftl_lightning.services.randomness import generator, task_key
 
 FINAL_SAMPLES, HELD_OUT_SAMPLES = 128, 32
@@ -42,6 +43,7 @@ Watch = Callable[[int, float, Callable[[], dict[str, Concept]]], None]
 returns the current concepts by name."""
 
 
+@usual_modes()
 def invert(
     model: Invertible,
     demonstrations: Demonstrations,

@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Literal
 
 from ftl_lightning.igm.concept import ADAPTER, KIND, MODES, VERSION, Concept, Origin, QualityRecord, file_name
-from ftl_lightning.services.errors import UserError, about, require, short, shown
+from ftl_lightning.services.errors import UserError, about, short, shown
 from ftl_lightning.services.files import check_writable_file
 from ftl_lightning.services.tensor_file import check_kind, data_folder, load_header, visible
-from ftl_lightning.services.text import Shown, counted, line, say
+from ftl_lightning.services.text import Shown, counted, folded, line, say
 from ftl_lightning.services.validation import from_mapping
 
 Kind = Literal["training", "shipped", "saved"]
@@ -252,12 +252,19 @@ def library(model: str, training: Sequence[str], shipped: Path | None = None, fo
 def concept_files(names: Iterable[str], folder: Path, place: str) -> dict[str, Path]:
     """Output files of learned concepts in ``folder``, by the ``names`` of the concepts. ``place`` names the option in messages.
 
+    Files are numbered from the second on if their names are equal, or differ only by case or Unicode normal form, which some file
+    systems do not distinguish.
+
     Raises:
-        UserError: for two names with the same file, or a file that cannot be written.
+        UserError: for a file that cannot be written.
     """
-    files = {name: folder / f"{file_name(name)}.safetensors" for name in names}
-    names = short(", ".join(files), 150)
-    require(len(set(files.values())) == len(files), "concepts", "names that differ in their letters", names)
+    files: dict[str, Path] = {}
+    taken: set[str] = set()
+    for name in dict.fromkeys(names):
+        stems = (f"{file_name(name)}{f'_{number}' if number else ''}" for number in itertools.count())
+        stem = next(stem for stem in stems if folded(stem) not in taken)
+        taken.add(folded(stem))
+        files[name] = folder / f"{stem}.safetensors"
     for path in files.values():
         check_writable_file(path, place)
     return files

@@ -6,8 +6,19 @@ from functools import cache
 import torch
 from torch import Tensor, nn
 
+from ftl_lightning.services.errors import require
+
 LEAST = 1e-6
 """Minimum standard deviation relative to the largest; coefficients below are constant."""
+
+
+MOST_COSINES = 2048
+"""Maximum number of states in a plan that is transformed; the transform's matrix has its square."""
+
+
+def check_cosines(horizon: int, user: str) -> None:
+    """Refuse plans that are too long for a cosine transform; ``user`` names what needs it in the ``UserError``."""
+    require(horizon <= MOST_COSINES, "horizon", f"at most {MOST_COSINES} states for {user}", f"{horizon}; set data.horizon")
 
 
 @cache

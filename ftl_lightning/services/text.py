@@ -7,14 +7,16 @@ figure or a message through :func:`line`.
 import html
 import io
 import json
+import os
 import re
+import stat
 import sys
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
-from unicodedata import category
+from unicodedata import category, normalize
 
-from ftl_lightning.services.errors import LONGEST, short
+from ftl_lightning.services.errors import LONGEST, short, shown
 
 
 def plain(text: str) -> str:
@@ -25,6 +27,23 @@ def plain(text: str) -> str:
 def line(text: str) -> str:
     """:func:`plain` in a single line, with single spaces."""
     return plain(" ".join(text.split()))
+
+
+def folded(text: str) -> str:
+    """A text without differences by case, spaces or Unicode normal form, for comparison."""
+    return " ".join(normalize("NFKC", text).casefold().split())
+
+
+def alike(texts: Iterable[str]) -> Iterator[str]:
+    """A line for each two different ``texts`` that are equal once :func:`folded`."""
+    first: dict[str, str] = {}
+    for text in dict.fromkeys(texts):
+        before = first.setdefault(folded(text), text)
+        if before != text:
+            letters = normalize("NFC", before) != normalize("NFC", text)
+            show: Callable[[str], str] = shown if letters else lambda name: short(ascii(name))
+            pair = f"{show(before)} and {show(text)}"
+            yield f"{pair} are different concepts, but their names differ only by case, spaces or Unicode form; is one a slip?"
 
 
 _silent = False
@@ -47,8 +66,23 @@ def say(*parts: object, error: bool = False) -> None:
         print(plain(text), file=sys.stderr if error else sys.stdout, flush=True)
 
 
+class _Pipe(io.FileIO):
+    """A pipe whose reader may end before the program, as ``head`` does; text without a reader is dropped."""
+
+    def write(self, content: Any) -> int:
+        try:
+            return super().write(content)
+        except BrokenPipeError:
+            return memoryview(content).nbytes
+
+
 def any_terminal() -> None:
-    """Let standard output replace characters that its encoding lacks, such as ± in ASCII, by question marks."""
+    """Let standard output replace characters that its encoding lacks, such as ± in ASCII, by question marks, and let a pipe end."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is getattr(sys, f"__{name}__") and stream is not None and stat.S_ISFIFO(os.fstat(stream.fileno()).st_mode):
+            pipe = io.BufferedWriter(_Pipe(stream.fileno(), "w", closefd=False))
+            setattr(sys, name, io.TextIOWrapper(pipe, stream.encoding, stream.errors, line_buffering=True))
     if isinstance(sys.stdout, io.TextIOWrapper):  # not a notebook's
         sys.stdout.reconfigure(errors="replace")
 

@@ -17,8 +17,8 @@ from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import NEW_COMPONENT, Concept, Point, file_name
 from ftl_lightning.igm.library import concept_files, write_concept
 from ftl_lightning.services import log_folder
-from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.text import say
+from ftl_lightning.services.errors import UserError, note
+from ftl_lightning.services.modes import usual_modes
 from ftl_lightning.training.checks import longer_than_plans, notes_of
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.data import InversionData
@@ -117,8 +117,8 @@ class Adaptation(pl.LightningModule, ABC):
         if self.model.examples is not None:  # a user's data: new concepts are judged by their demonstrations
             self.domain = judging_domain(self.model, [self.model.examples, self.demonstrations])
         longer = longer_than_plans(self.demonstrations, self.model)
-        for note in notes_of(self.model, self.demonstrations) if self._of_user and data.check else [longer] if longer else []:
-            say(f"note: {note}", error=True)
+        for text in notes_of(self.model, self.demonstrations) if self._of_user and data.check else [longer] if longer else []:
+            note(text)
 
     def training_step(self, batch: int) -> None:
         """Learn all concepts."""
@@ -149,6 +149,7 @@ class Adaptation(pl.LightningModule, ABC):
         """Folder of the learned concepts."""
         return Path(self._output or Path(self.trainer.log_dir or self.trainer.default_root_dir) / "concepts")
 
+    @usual_modes()
     def find(self) -> None:
         """Learn the concepts and write each to a file."""
         log_folder.keep()  # also without training

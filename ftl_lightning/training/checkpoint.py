@@ -1,8 +1,11 @@
 """Checkpoints: written atomically, bound to a module class, and complete, so that a resumed run ends with the same bytes."""
 
+import hashlib
 import io
+import json
 import zipfile
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,7 +16,8 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 from packaging.version import InvalidVersion, Version
 from torch import Tensor
 
-from ftl_lightning.services.errors import UserError, require, shown
+from ftl_lightning.data.demonstrations import Demonstrations
+from ftl_lightning.services.errors import UserError, require, short, shown
 from ftl_lightning.services.files import check_readable
 from ftl_lightning.services.tensor_file import atomic, check_finite, visible
 
@@ -213,4 +217,49 @@ def check_signature(expected: Mapping[str, Any], checkpoint: Mapping[str, Any]) 
     signature = checkpoint.get(SIGNATURE, {})
     for key in expected | signature:
         value, setting = signature.get(key), expected.get(key)
-        require(value == setting, f"ckpt_path: key {key!r}", f"{setting}", f"{value}; it is the checkpoint of something else")
+        message = f"{short(str(value), 90)}; it is the checkpoint of something else"
+        require(value == setting, f"ckpt_path: key {key!r}", short(str(setting), 90), message)
+
+
+def data_hash(demonstrations: Demonstrations) -> str:
+    """16-digit hash of demonstrations and their concepts, without a copy of large tensors."""
+    digest = hashlib.sha256(json.dumps(demonstrations.concepts).encode())
+    for name, tensor in sorted(demonstrations.tensors.items()):
+        digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
+        for row in tensor:
+            digest.update(row.contiguous().numpy())
+    return digest.hexdigest()[:16]
+
+
+PATHS = ("output", "root", "demonstrations", "more")
+"""Hyper-parameters that name places; the content of data is compared by :func:`data_hash`."""
+
+
+def changed_options(before: object, now: Mapping[str, Any], section: str, places: Mapping[str, str]) -> dict[str, str]:
+    """Hyper-parameters that differ from a checkpoint's, by option, as ``'value (before: value)'``.
+
+    Args:
+        before: hyper-parameters in the checkpoint.
+        now: hyper-parameters of the run.
+        section: ``'model'`` or ``'data'``.
+        places: grouped options by flat name, see :func:`~ftl_lightning.services.validation.groups_of`.
+    """
+    if not isinstance(before, Mapping):
+        raise UserError(f"ckpt_path: expected the options of {section}, found {_kind(before)}; it is damaged")
+    names = [name for name in now if name in before and name not in PATHS and not name.startswith("_")]
+    return {
+        f"{section}.{places.get(name, name)}": f"{shown(now[name], 40)} (before: {shown(before[name], 40)})"
+        for name in names
+        if json.dumps(now[name], sort_keys=True, default=str) != json.dumps(before[name], sort_keys=True, default=str)
+    }
+
+
+def apply_rates(checkpoint: Mapping[str, Any], learning_rate: float, weight_decay: float) -> None:
+    """Replace the learning rate and weight decay in a checkpoint's optimiser and schedule, which torch would restore."""
+    with suppress(KeyError, IndexError, TypeError, AttributeError):  # a damaged part is refused where it is restored
+        schedule, groups = checkpoint["lr_schedulers"][0], checkpoint["optimizer_states"][0]["param_groups"]
+        (before,) = schedule["base_lrs"]
+        for group in groups:
+            group["lr"] = learning_rate * (group["lr"] / before if before else 0)
+            group["initial_lr"], group["weight_decay"] = learning_rate, weight_decay
+        schedule["base_lrs"], schedule["_last_lr"] = [learning_rate], [group["lr"] for group in groups]

@@ -17,7 +17,7 @@ from ftl_lightning.igm.forms.leave_one_out import LeaveOneOut, leave_one_out, re
 from ftl_lightning.igm.settings import InversionSettings
 from ftl_lightning.services.errors import about, require, short
 from ftl_lightning.services.progress import bar
-from ftl_lightning.services.text import counted
+from ftl_lightning.services.text import alike, counted
 from ftl_lightning.training.concept_model import ConceptModel
 
 MARGIN, MOST_OF = 0.97, 0.8
@@ -128,7 +128,10 @@ def warnings_of(model: ConceptModel, demonstrations: Demonstrations) -> tuple[st
 
 
 def notes_of(model: ConceptModel, demonstrations: Demonstrations) -> Iterator[str]:
-    """Lines about demonstrations that are longer than plans, and about likely faults of each concept's demonstrations."""
+    """Lines about names that are alike, demonstrations that are longer than plans, and likely faults of each concept's
+    demonstrations.
+    """
+    yield from alike(demonstrations.concepts)
     if longer := longer_than_plans(demonstrations, model):
         yield longer
     names = dict.fromkeys(demonstrations.concepts)

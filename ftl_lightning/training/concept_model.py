@@ -4,7 +4,7 @@ import difflib
 import logging
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -63,8 +63,7 @@ class ConceptModel(Shown, nn.Module, ABC):
         config, domain = prepared.config, prepared.domain
         self.config, self.domain = config, domain
         self.examples: Demonstrations | None = None
-        self.view = find_view(domain, config.view)
-        self._perturb = self.view.perturb if config.perturb and self.view is not None else None
+        self._see()
         perturbs = not config.perturb or self._perturb is not None
         require(perturbs, "model.perturb", "a view that can perturb the present", repr(config.view))
         images = config.image_dim or not config.image_encoder
@@ -77,6 +76,17 @@ class ConceptModel(Shown, nn.Module, ABC):
         self.initial_normalization = prepared.observed
         self.register_buffer("empty", prepared.embeddings[0].clone())
         self.register_buffer("training_embeddings", prepared.embeddings[1:].clone())
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "view": None, "_perturb": None}  # functions of the domain
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        self._see()
+
+    def _see(self) -> None:
+        self.view = find_view(self.domain, self.config.view)
+        self._perturb = self.view.perturb if self.config.perturb and self.view is not None else None
 
     def _words(self) -> Iterator[str]:
         yield repr(self.config.domain)

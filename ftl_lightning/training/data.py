@@ -18,11 +18,13 @@ from ftl_lightning.data.check import check_each
 from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.data.features import check_features
 from ftl_lightning.domains.domain import OWN, Domain, Recoveries
-from ftl_lightning.domains.from_file import domain_from_file, read_demonstrations, read_own
+from ftl_lightning.domains.from_file import FileSource, domain_from_file, read_demonstrations, read_own
 from ftl_lightning.domains.registry import load_domain, recorded_name
 from ftl_lightning.networks.text_encoder import Encoder, load_encoder
 from ftl_lightning.services.errors import UserError, note, require, short
+from ftl_lightning.services.modes import single_precision
 from ftl_lightning.services.randomness import DEMONSTRATION_SEED, drawn, generator, rows_of
+from ftl_lightning.services.text import alike
 from ftl_lightning.services.validation import LARGEST_STEP, MOST_TOGETHER, check_count, check_factor, check_range
 
 
@@ -144,6 +146,7 @@ class PretrainingData(pl.LightningDataModule):
         """Recorded name and domain."""
         return recorded_name(name), load_domain(name)
 
+    @single_precision()
     def setup(self, stage: str) -> None:
         source = self.domain.source(self.root)
         self.training = source.split("train", self.samples_per_concept, self.seed).fitted(self.domain.observed)
@@ -178,6 +181,7 @@ class PretrainingData(pl.LightningDataModule):
         """Demonstrations saved with a model of user data, else ``None``."""
         return None
 
+    @single_precision()
     def batch(self, step: int) -> Batch:
         """Batch of a step (this process's share): demonstrations drawn with replacement, a window of each."""
         draw, count = generator("cpu", self.seed, step), self.batch_size
@@ -224,6 +228,7 @@ class PretrainingData(pl.LightningDataModule):
         steps = Steps(self, self.steps_per_epoch)
         return DataLoader(steps, batch_size=None, collate_fn=self.batch)  # type: ignore[arg-type]
 
+    @single_precision()
     def val_dataloader(self) -> DataLoader[Batch]:
         rows = torch.arange(len(self.validation))
         batch = self._windows(self.validation, rows, generator("cpu", self.seed))
@@ -235,7 +240,8 @@ class PretrainingData(pl.LightningDataModule):
 class OwnData(PretrainingData):
     """Batches of user demonstrations; the file, with a concept text per demonstration, defines the domain.
 
-    Plans have the length of the longest demonstration unless ``horizon`` is given.
+    Plans have the length of the longest demonstration unless ``horizon`` is given, or demonstrations are longer than
+    :data:`~ftl_lightning.domains.from_file.LONGEST_PLAN`.
 
     Args:
         demonstrations: the file (``.npz`` or safetensors), see
@@ -284,6 +290,13 @@ class OwnData(PretrainingData):
         )
         self.save_hyperparameters()
         self.metrics = self._metrics
+        source = self.domain.source(None)
+        assert isinstance(source, FileSource)
+        if horizon is None and self.horizon < (longest := int(source.demonstrations.lengths.max())):
+            text = f"demonstrations have up to {longest} steps, so plans are windows of {self.horizon}"
+            note(f"data.horizon: {text}; --data.horizon N makes them longer or shorter")
+        for text in alike(self.domain.concepts.training):
+            note(text)
 
     def _domain(self, name: str) -> tuple[str, Domain]:
         return OWN, domain_from_file(self._file, self._horizon, self._metrics, self._share, self._kinds)

@@ -20,6 +20,7 @@ from ftl_lightning.igm.settings import (
     ModeOptions,
     WeightOptions,
 )
+from ftl_lightning.services.modes import usual_modes
 from ftl_lightning.services.progress import bar
 from ftl_lightning.services.validation import flat, groups_of
 from ftl_lightning.training.adaptation import Adaptation, LearnerAdaptation
@@ -79,6 +80,7 @@ class InversionModule(Adaptation):
     def adapts(cls, model: type[ConceptModel]) -> bool:
         return model.invertible
 
+    @usual_modes()
     def configure_model(self) -> None:
         """Create the parameters once the demonstrations are known, and only once."""
         if "inversion" not in self._modules:

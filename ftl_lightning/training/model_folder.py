@@ -16,6 +16,7 @@ from ftl_lightning.domains.domain import OWN, Domain
 from ftl_lightning.domains.from_file import own_domain
 from ftl_lightning.domains.registry import domain_of_file, is_known, load_domain
 from ftl_lightning.services.errors import UserError, about, short
+from ftl_lightning.services.modes import usual_modes
 from ftl_lightning.services.shipped import pretrained_folder
 from ftl_lightning.services.tensor_file import alone, check_finite, file_hash, load_tensors, save_tensors, write_text
 from ftl_lightning.services.validation import from_mapping
@@ -44,6 +45,7 @@ def save_model(model: ConceptModel, folder: str | Path) -> None:
         write_text(folder / CONFIG, json.dumps(header | asdict(model.config), indent=2) + "\n")
 
 
+@usual_modes()
 def read_model(kind: type[M], folder: str | Path, domain: Domain | None = None) -> M:
     """Read a folder written by :func:`save_model`; the model is frozen and in evaluation mode.
 

@@ -1,6 +1,7 @@
 """Pretraining of a concept-conditioned model on a domain's demonstrations, for any method."""
 
 import copy
+import functools
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -10,6 +11,7 @@ from typing import Any, ClassVar, Generic, Self, TypeVar
 
 import lightning.pytorch as pl
 import torch
+from lightning.pytorch.trainer.states import TrainerFn
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor
 
@@ -22,11 +24,22 @@ from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import Point
 from ftl_lightning.networks.image_encoder import ImageEncoders
 from ftl_lightning.networks.text_encoder import EMPTY
-from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.errors import UserError, note, short
+from ftl_lightning.services.modes import single_precision
 from ftl_lightning.services.randomness import generator, mean, rows_of
 from ftl_lightning.services.tensor_file import check_finite
+from ftl_lightning.services.text import say
 from ftl_lightning.services.validation import LARGEST_FACTOR, LARGEST_RATE, check_factor, check_range, groups_of
-from ftl_lightning.training.checkpoint import SIGNATURE, Random, check_parameters, check_restored, check_signature
+from ftl_lightning.training.checkpoint import (
+    SIGNATURE,
+    Random,
+    apply_rates,
+    changed_options,
+    check_parameters,
+    check_restored,
+    check_signature,
+    data_hash,
+)
 from ftl_lightning.training.concept_model import ConceptModel, joined_vectors
 from ftl_lightning.training.data import Batch, PretrainingData
 from ftl_lightning.training.model_config import ModelConfig, Prepared, find_view, width_of
@@ -34,6 +47,8 @@ from ftl_lightning.training.model_folder import save_model
 from ftl_lightning.training.teaching import Teaching
 
 M = TypeVar("M", bound=ConceptModel)
+_DATA = "data"
+"""Key of the training data's hash in a checkpoint's signature."""
 
 
 class Pretraining(pl.LightningModule, ABC, Generic[M]):
@@ -144,6 +159,7 @@ class Pretraining(pl.LightningModule, ABC, Generic[M]):
             with torch.device("cpu"):  # with the data; Lightning moves the layers afterwards
                 self._configure()
 
+    @single_precision()
     def _configure(self) -> None:
         data = self.trainer.datamodule  # type: ignore[attr-defined]
         if not isinstance(data, PretrainingData):
@@ -230,6 +246,7 @@ class Pretraining(pl.LightningModule, ABC, Generic[M]):
         """Check the restored state."""
         check_restored(self, self.resumed_from)
 
+    @single_precision()
     def training_step(self, batch: Batch) -> Tensor:
         with rows_of(self.trainer.global_rank, self.trainer.world_size):
             return self._training_loss(batch)
@@ -264,6 +281,7 @@ class Pretraining(pl.LightningModule, ABC, Generic[M]):
                 # No public name: a single call for all parameters.
                 torch._foreach_lerp_(list(self.model.parameters()), list(self.raw.parameters()), 1 - decay)
 
+    @single_precision()
     def _evaluation_step(self, batch: Batch, name: str) -> None:
         # Fixed noise, so that the curve shows the model alone. Each process evaluates the whole set.
         loss = self._perturbed_losses(self.model, batch, generator(self.device, self.seed))[0].mean()
@@ -330,7 +348,7 @@ class Pretraining(pl.LightningModule, ABC, Generic[M]):
         Raises:
             UserError: if a parameter is not finite; an existing checkpoint is kept.
         """
-        checkpoint[SIGNATURE] = self.signature()
+        checkpoint[SIGNATURE] = self.signature() | {_DATA: self._data_hash}
         place = f"training: step {self.global_step}"
         check_finite(checkpoint["state_dict"], place, "nothing was saved of it; lower the learning rate")
         # No public name: whether a validation follows, which draws a random number before the next step.
@@ -339,17 +357,47 @@ class Pretraining(pl.LightningModule, ABC, Generic[M]):
         Random.now(self.device, int(validates) + int(self.trainer.is_last_batch)).write(checkpoint)
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Refuse a checkpoint of another module or model configuration."""
-        check_signature(self.signature(), checkpoint)
+        """Refuse a checkpoint of another module or model configuration, or to go on with other training data.
+
+        Other hyper-parameters of the run replace those of the checkpoint, with a note.
+        """
+        own = dict(checkpoint.get(SIGNATURE, {}))
+        known = own.pop(_DATA, None)
+        check_signature(self.signature(), checkpoint | {SIGNATURE: own})
         check_parameters(checkpoint["state_dict"], self)
+        if self.trainer.state.fn == TrainerFn.FITTING:
+            self._go_on(checkpoint, known)
+        elif known != self._data_hash:
+            say("note: ckpt_path: the checkpoint was trained on other data than these", error=True)
         self.resumed_from = checkpoint["global_step"]
         self._random = Random.read(checkpoint)
 
     def signature(self) -> dict[str, Any]:
         """Configuration that decides the shapes and meaning of a checkpoint's parameters."""
-        excluded = ("training", "training_concepts", "perturb", "metrics", "feature_dropout")
+        excluded = ("training", "perturb", "metrics", "feature_dropout")
         config = {key: value for key, value in asdict(self.model.config).items() if key not in excluded}
-        return {"module_class": type(self).__name__, **config}
+        plans = self.domain.plans
+        return {"module_class": type(self).__name__, **config, "columns": plans.columns, "units": plans.units, "kinds": plans.kinds}
+
+    @functools.cached_property
+    def _data_hash(self) -> str:
+        """Hash of the training data."""
+        return data_hash(self.trainer.datamodule.training)  # type: ignore[attr-defined]
+
+    def _go_on(self, checkpoint: Mapping[str, Any], data: object) -> None:
+        """Compare the run with the checkpoint that it goes on from."""
+        hparams = self.trainer.datamodule.hparams  # type: ignore[attr-defined]
+        of_data = changed_options(checkpoint.get("datamodule_hyper_parameters"), hparams, "data", {})
+        of_model = changed_options(checkpoint.get("hyper_parameters"), self.hparams, "model", self.flat)
+        if data != self._data_hash:
+            changes = "".join(f", {name} {change}" for name, change in of_data.items())
+            expected = f"the training data of the checkpoint (hash {short(str(data))})"
+            reason = "their scale and concepts would stay those of the checkpoint; start anew without --ckpt_path"
+            raise UserError(f"ckpt_path: expected {expected}, found others (hash {self._data_hash}{changes[:80]}): {reason}")
+        if {"model.learning_rate", "model.weight_decay"} & of_model.keys():
+            apply_rates(checkpoint, self.hparams["learning_rate"], self.hparams["weight_decay"])
+        if changes := ", ".join(f"{name} {change}" for name, change in (of_model | of_data).items()):
+            note(f"ckpt_path: from step {checkpoint['global_step']} on, {changes}")
 
 
 def check_dropout(shares: Mapping[str, float], features: Mapping[str, Feature]) -> dict[str, float]:

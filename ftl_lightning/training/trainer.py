@@ -17,7 +17,8 @@ from lightning.pytorch.strategies.launchers import _SubprocessScriptLauncher  # 
 from lightning.pytorch.utilities import rank_zero_only
 
 from ftl_lightning.services import log_folder
-from ftl_lightning.services.errors import UserError, mistake_behind, mistake_of_machine, require, short
+from ftl_lightning.services.errors import UserError, mistake_behind, mistake_of_machine, note, require, short
+from ftl_lightning.services.modes import single_precision, usual_modes
 from ftl_lightning.services.text import line, silence
 from ftl_lightning.services.validation import check_count, check_range
 from ftl_lightning.training.adaptation import Adaptation
@@ -57,6 +58,8 @@ MOST_DEVICES, MOST_PROCESSES = 10_000, 256
 """Maximum number of devices or nodes, and of processes that learn concepts."""
 SHARES = ("limit_train_batches", "limit_val_batches", "limit_test_batches", "overfit_batches", "val_check_interval")
 """Options that are a share or a number, which Lightning does not check."""
+PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")
+"""Supported precisions: weights, data and learned concepts are float32."""
 _STARTS = ("`val_check_interval`", "Early stopping conditioned")
 """Beginnings of Lightning's messages about options."""
 _LOST = ("gloo", "NCCL", "Connection closed", "Connection reset", "Broken pipe", "TCPStore", "store->get")
@@ -129,6 +132,7 @@ class Trainer(pl.Trainer):
             raise UserError(f"trainer: {short(str(error), 200)}") from error
         if isinstance(self.accelerator, CPUAccelerator):
             check_range("trainer.devices", self.num_devices, 1, os.cpu_count() or 1)
+        require(self.precision in PRECISIONS, "trainer.precision", f"one of {', '.join(PRECISIONS)}", repr(self.precision))
         parameters = inspect.signature(pl.Trainer.__init__).parameters
         usual = {name: parameter.default for name, parameter in parameters.items()} | USUAL
         self.unusual = {
@@ -146,6 +150,7 @@ class Trainer(pl.Trainer):
         processes = self.num_devices * self.num_nodes
         require(processes == 1, "trainer.devices", f"1 for {verb}", f"{processes}; {instead}")
 
+    @usual_modes()
     def fit(self, model: pl.LightningModule, *arguments: Any, **options: Any) -> None:
         """Lightning's ``fit``, for models that learn."""
         if isinstance(model, Adaptation) and not model.learns:
@@ -167,13 +172,18 @@ class Trainer(pl.Trainer):
                     raise LostProcess(f"trainer.devices: {expected}; go on with --ckpt_path last") from error
                 raise
         _expect_monitors(self)
+        if self.ckpt_path and self.global_step == getattr(model, "resumed_from", None):
+            ended = f"the run had ended at step {self.global_step}, so nothing was learned; raise trainer.max_steps to go on"
+            note(f"ckpt_path: {ended}")
 
+    @single_precision()
     def validate(self, *arguments: Any, **options: Any) -> Any:
         """Lightning's ``validate``, in a single process."""
         self.check_alone("validate")
         with self._restoring():
             return super().validate(*arguments, **options)
 
+    @single_precision()
     def test(self, *arguments: Any, **options: Any) -> Any:
         """Lightning's ``test``, in a single process."""
         self.check_alone(self.verb if self.verb == "invert" else "test")

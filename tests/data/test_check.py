@@ -115,7 +115,7 @@ def test_a_length_far_from_the_others_and_columns_or_behaviour_that_never_change
 def test_angles_that_wrap_are_noted() -> None:
     angle = (np.linspace(0, 12, 60) + np.linspace(0, 2, 5)[:, None]) % (2 * np.pi)
     found = check(demonstrations(np.stack((angle, np.random.default_rng(0).normal(size=(5, 60)).cumsum(1)), axis=-1)))
-    assert any(one.severity == "note" and "give sine and cosine" in one.text for one in found)
+    assert any(one.severity == "note" and "angle with a turn of 6.28319" in one.text for one in found)
 
 
 def test_what_is_missing_is_told_and_mended_by_straight_lines() -> None:

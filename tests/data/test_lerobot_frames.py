@@ -2,6 +2,7 @@
 
 import json
 import resource
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import pandas as pd
 import pytest
 
 from ftl_lightning.data.demonstrations import Demonstrations
-from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.errors import Note, UserError
 from tests.conftest import refused, succeed
 from tests.data.test_lerobot import old
 
@@ -61,13 +62,14 @@ def write(frames: pd.DataFrame, folder: str = "robot", tasks: tuple[str, ...] = 
     (root / "meta/info.json").write_text(json.dumps(info | changes))
 
 
-def read(capsys: pytest.CaptureFixture[str]) -> tuple[Demonstrations, list[str]]:
+def read(folder: str = "robot") -> tuple[Demonstrations, list[str]]:
     """Demonstrations and the notes on them, without their beginning."""
-    capsys.readouterr()
-    found = Demonstrations.load("robot")
-    lines = capsys.readouterr().err.splitlines()
-    assert all(line.startswith("note: robot: ") for line in lines)
-    return found, [line.removeprefix("note: robot: ") for line in lines]
+    with warnings.catch_warnings(record=True) as notes:
+        warnings.simplefilter("always", Note)
+        found = Demonstrations.load(folder)
+    lines = [str(note.message) for note in notes]
+    assert all(line.startswith(f"{folder}: ") for line in lines)
+    return found, [line.removeprefix(f"{folder}: ") for line in lines]
 
 
 def changed(column: str, rows: slice | list[int], values: Any) -> pd.DataFrame:
@@ -81,24 +83,24 @@ SECOND = slice(STEPS, 2 * STEPS)  # rows of episode 1
 
 def test_frames_are_in_the_order_of_their_numbers(capsys: pytest.CaptureFixture[str]) -> None:
     write(table())
-    whole, notes = read(capsys)
+    whole, notes = read()
     assert notes == []
     assert whole.states[:, :, 1].tolist() == [list(range(STEPS))] * 4
     write(table().sample(frac=1, random_state=0))
-    found, notes = read(capsys)
+    found, notes = read()
     assert found.hash == whole.hash
     assert notes == ["episodes 0, 1, 2, 3: frames in another order than 'frame_index'; sorted"]
     write(table().iloc[[*range(2 * STEPS, 4 * STEPS), *range(2 * STEPS)]])  # files in another order are none of frames
-    found, notes = read(capsys)
+    found, notes = read()
     assert (found.hash, notes) == (whole.hash, [])
     backwards = changed("frame_index", SECOND, np.arange(STEPS)[::-1])
     backwards.loc[backwards.index[SECOND], "timestamp"] = (np.arange(STEPS)[::-1] / 10).astype("f4")
     write(backwards)
-    found, notes = read(capsys)
+    found, notes = read()
     assert found.states[1, :, 1].tolist() == list(range(STEPS))[::-1]
     assert notes == ["episode 1: frames in another order than 'frame_index'; sorted"]
     write(backwards.drop(columns="frame_index"))
-    found, notes = read(capsys)
+    found, notes = read()
     assert found.states[1, :, 1].tolist() == list(range(STEPS))[::-1]
     assert notes == ["episode 1: frames in another order than 'timestamp'; sorted"]
     succeed("check", "robot")
@@ -135,7 +137,7 @@ TIMES: dict[str, tuple[Callable[[], pd.DataFrame], list[str]]] = {
 def test_faults_of_times_are_told_by_episode(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     frames, expected = TIMES[name]
     write(frames())
-    found, notes = read(capsys)
+    found, notes = read()
     notes = [note for note in notes if "uneven" not in note] if name in ("back", "twice") else notes
     assert notes == expected
     assert len(found) == 4
@@ -144,9 +146,9 @@ def test_faults_of_times_are_told_by_episode(name: str, capsys: pytest.CaptureFi
 def test_many_episodes_are_counted_and_an_unknown_rate_is_no_fault(capsys: pytest.CaptureFixture[str]) -> None:
     write(table(12, fps=5))
     expected = "episodes 0, 1, 2, 3, 4, 5, 6, 7 and 4 others: 5 frames a second by 'timestamp', not 10 as in info.json"
-    assert read(capsys)[1] == [expected]
+    assert read()[1] == [expected]
     write(table(12, fps=5), fps=None)
-    assert read(capsys)[1] == []
+    assert read()[1] == []
     for fps in (0, -1, "ten", True):
         write(table(), fps=fps)
         refused(capsys, ["check", "robot"], "robot/meta/info.json: key 'fps': expected")
@@ -156,7 +158,7 @@ def test_an_episode_of_several_tasks_is_a_demonstration_for_each(capsys: pytest.
     frames = table()
     frames.loc[frames.index[SECOND], "task_index"] = [0] * 3 + [1] * 4 + [0] * 5
     write(frames.sample(frac=1, random_state=1))
-    found, notes = read(capsys)
+    found, notes = read()
     assert notes[1:] == ["episode 1: several tasks; each is a demonstration"]
     assert found.concepts == ("reach", "reach", "push", "reach", "reach", "push")
     assert found.lengths.tolist() == [12, 3, 4, 5, 12, 12]
@@ -172,10 +174,9 @@ def test_older_versions_are_sorted_too(capsys: pytest.CaptureFixture[str]) -> No
     pq.write_table(
         pq.read_table(first := path.with_name("episode_000000.parquet")).append_column("frame_index", pa.array([0, 1, 2])), first
     )
-    capsys.readouterr()
-    found = Demonstrations.load("robot")
+    found, notes = read()
     assert found.states[1, :, 1].tolist() == [1, 2, 0, 3]
-    assert "note: robot: episode 1: frames in another order than 'frame_index'; sorted" in capsys.readouterr().err
+    assert "episode 1: frames in another order than 'frame_index'; sorted" in notes
 
 
 def peak() -> int:

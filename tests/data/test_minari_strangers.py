@@ -11,7 +11,7 @@ import torch
 from gymnasium.spaces import Box, Dict, Discrete, Text, Tuple
 
 from ftl_lightning.data.demonstrations import Demonstrations
-from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.errors import Note, UserError
 from tests.conftest import refused, succeed
 
 minari = pytest.importorskip("minari", reason="the extra 'minari' is not installed")
@@ -58,9 +58,8 @@ def test_all_nested_parts_are_read_or_named(form: str, capsys: pytest.CaptureFix
     episodes = [episode(nested(2), 2, {"concept": ["go"] * 3}), episode(nested(3), 3)]
     action = Box(-1, 1, (1,), np.float32)
     minari.create_dataset_from_buffers("robot-v0", episodes[:1], observation_space=NESTED, action_space=action, data_format=form)
-    capsys.readouterr()
-    found = Demonstrations.load("robot-v0")
-    assert capsys.readouterr().err == "note: robot-v0: left out camera, goal/desired/kind, words: only vectors are read\n"
+    with pytest.warns(Note, match="robot-v0: left out camera, goal/desired/kind, words: only vectors are read"):
+        found = Demonstrations.load("robot-v0")
     means = {name: (tuple(values.shape), round(float(values.mean()), 4)) for name, values in found.observed.items()}
     assert means == {
         "goal/achieved": ((1, 3, 3), 0.2),

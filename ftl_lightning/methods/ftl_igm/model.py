@@ -16,7 +16,7 @@ from ftl_lightning.igm.model import DiffusionModel, Draws
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.methods.ftl_igm import METHOD
 from ftl_lightning.services.errors import require, short
-from ftl_lightning.services.spectrum import Spectrum
+from ftl_lightning.services.spectrum import Spectrum, check_cosines
 from ftl_lightning.services.validation import check_range, from_mapping
 from ftl_lightning.training.concept_model import TextConceptModel
 from ftl_lightning.training.model_config import ModelConfig, Prepared
@@ -63,6 +63,8 @@ def build_denoiser(config: DiffusionConfig) -> nn.Module:
         return denoiser
     columns = len(config.state_columns)
     require(columns in (0, config.state_dim), "observed, state", f"{config.state_dim} columns", columns)
+    if config.prediction == "cosines":
+        check_cosines(config.horizon, "model.prediction cosines")
     spectrum = Spectrum(config.horizon, config.state_dim) if config.prediction == "cosines" else None
     return Prediction(denoiser, config.prediction, config.diffusion_steps, config.state_columns, spectrum)
 
