@@ -3,17 +3,13 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ftl_lightning.data.demonstrations import Demonstrations, paths_of
 from ftl_lightning.services.errors import UserError, note, require, short
 
-COARSE = 1e-4
-"""Maximum spacing of float32 at a column's largest number, as a share of the column's range; more needs float64."""
 LOST = 1e-2
 """The same for float32 files, whose steps are lost beyond; for columns that move smoothly."""
 SMOOTH = 0.8
@@ -26,20 +22,6 @@ UNITS = {
     **{"s": ("time", 1.0), "ms": ("time", 0.001), "min": ("time", 60.0)},
 }
 """Quantity and factor of units that are converted."""
-
-
-def precise(values: NDArray[Any]) -> NDArray[np.float32] | NDArray[np.float64]:
-    """Convert states ``(..., column)`` to float32, or to float64 if float32 cannot hold how a column varies."""
-    with np.errstate(over="ignore", invalid="ignore"):  # overflow is reported later as a number that is not finite
-        single = np.asarray(values, dtype=np.float32)
-        if values.dtype.itemsize <= 4 or values.dtype.kind not in "fiu" or not values.size or values.ndim < 2:
-            return single
-        flat = np.asarray(values, dtype=np.float64).reshape(-1, values.shape[-1])
-        finite = np.isfinite(flat)
-        low, high = np.where(finite, flat, np.inf).min(axis=0), np.where(finite, flat, -np.inf).max(axis=0)
-        spacing = np.spacing(np.maximum(np.abs(low), np.abs(high)).astype(np.float32)).astype(np.float64)
-        coarse = (spacing > COARSE * (high - low)) & (high - low > 1e-12 * np.maximum(np.abs(low), np.abs(high)))
-    return np.asarray(values, dtype=np.float64) if coarse.any() else single
 
 
 def check_precision(demonstrations: Demonstrations) -> None:

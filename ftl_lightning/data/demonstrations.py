@@ -8,7 +8,7 @@ from typing import Any, Self, TypedDict
 import torch
 from torch import Tensor
 
-from ftl_lightning.data.features import Feature, InitialStates, Observed, take
+from ftl_lightning.data.features import Feature, InitialStates, Observed, precise, take
 from ftl_lightning.services.errors import UserError, about, require, short
 from ftl_lightning.services.files import read_from, written_to
 from ftl_lightning.services.tensor_file import bytes_hash, serialise
@@ -51,6 +51,8 @@ class Format:
     write: Callable[["Demonstrations", str], None]
 
 
+FOREIGN = (".pkl", ".pickle", ".joblib", ".xlsx", ".xls", ".feather", ".zarr", ".bag", ".mcap", ".tfrecord", ".txt", ".gz", ".zip")
+"""Suffixes of files that are not read."""
 FORMATS: dict[str, Format] = {}
 """Formats by the suffix of a file, or by the kind of a data set."""
 
@@ -75,7 +77,11 @@ def _timed(contents: Contents, name: str) -> bool:
 
 def _format(kind: str, name: str) -> Format:
     """Format of a resolved name; files of unknown suffixes are safetensors."""
-    return FORMATS.get(Path(name).suffix if kind == "file" else kind, FORMATS[".safetensors"])
+    suffix = Path(name).suffix.lower() if kind == "file" else kind
+    known = ", ".join(suffix for suffix in FORMATS if suffix.startswith("."))
+    advice = f'{suffix}; convert it in Python: np.savez("file.npz", states=states, concepts=texts)'
+    require(suffix not in FOREIGN, name, f"a file of {known}", advice)
+    return FORMATS.get(suffix, FORMATS[".safetensors"])
 
 
 @dataclass(frozen=True, repr=False)
@@ -144,6 +150,29 @@ class Demonstrations(Shown):
             if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
                 where = (~torch.isfinite(tensor)).nonzero()[0].tolist()
                 raise UserError(f"key {key!r}: expected finite numbers, found {tensor[tuple(where)].item()} at index {where}")
+
+    @classmethod
+    def of(cls, states: Sequence[Any], concepts: str | Sequence[str] = "", **attributes: Any) -> Self:
+        """Demonstrations of any lengths from a list of arrays: ``Demonstrations.of(paths, "heart").save("five.npz")``.
+
+        Args:
+            states: an array ``(time, state)`` for each demonstration.
+            concepts: a text for each demonstration, or a single text for all.
+            attributes: further attributes of the class.
+
+        Raises:
+            UserError: for arrays of other shapes, or other attributes that do not fit.
+        """
+        paths = [torch.as_tensor(path).double() for path in states]
+        shapes = sorted({tuple(path.shape[1:]) for path in paths})
+        fits = len(shapes) == 1 and all(path.dim() == 2 and len(path) for path in paths)
+        require(fits, "states", "arrays (time, state) with the same columns", ", ".join(map(str, shapes)) or "none")
+        whole, lengths = padded(paths)
+        columns, count = whole.shape[2], len(whole)
+        unnamed = {"domain": "", "state_names": tuple(map(str, range(columns))), "state_units": ("",) * columns}
+        texts = (concepts,) * count if isinstance(concepts, str) else tuple(concepts)
+        numbers = torch.from_numpy(precise(whole.numpy()))
+        return cls(**{"states": numbers, "lengths": lengths, "concepts": texts, **unnamed, **attributes})
 
     def __len__(self) -> int:
         return len(self.states)

@@ -3,9 +3,11 @@
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ftl_lightning.services.errors import UserError, require
@@ -16,6 +18,9 @@ Observed = Mapping[str, Tensor]
 
 READ = "(read)"  # no user's feature has this name
 """Key of encoded images ``(sample, n)``, in place of the images."""
+
+COARSE = 1e-4
+"""Maximum spacing of float32 at a column's largest number, as a share of the column's range; more needs float64."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +72,20 @@ class Feature:
     def fits(self, expected: "Feature") -> bool:
         """Whether kind and shape equal those of another feature."""
         return (self.kind, self.shape) == (expected.kind, expected.shape)
+
+
+def precise(values: NDArray[Any]) -> NDArray[np.float32] | NDArray[np.float64]:
+    """Convert states ``(..., column)`` to float32, or to float64 if float32 cannot hold how a column varies."""
+    with np.errstate(over="ignore", invalid="ignore"):  # overflow is reported later as a number that is not finite
+        single = np.asarray(values, dtype=np.float32)
+        if values.dtype.itemsize <= 4 or values.dtype.kind not in "fiu" or not values.size or values.ndim < 2:
+            return single
+        flat = np.asarray(values, dtype=np.float64).reshape(-1, values.shape[-1])
+        finite = np.isfinite(flat)
+        low, high = np.where(finite, flat, np.inf).min(axis=0), np.where(finite, flat, -np.inf).max(axis=0)
+        spacing = np.spacing(np.maximum(np.abs(low), np.abs(high)).astype(np.float32)).astype(np.float64)
+        coarse = (spacing > COARSE * (high - low)) & (high - low > 1e-12 * np.maximum(np.abs(low), np.abs(high)))
+    return np.asarray(values, dtype=np.float64) if coarse.any() else single
 
 
 def take(observed: Observed, rows: Tensor | Sequence[int] | slice | int) -> dict[str, Tensor]:

@@ -319,7 +319,8 @@ class Domain(Shown):
         wanted = f"behaviour of {self.name}, the model's domain"
         require(demonstrations.domain in known, place, wanted, f"that of {short(demonstrations.domain)}")
         expected, columns = len(self.plans.columns), demonstrations.states.shape[2]
-        require(columns == expected, place, f"states of {expected} columns ({self.name})", columns)
+        advice = "; exchange axes 1 and 2" if demonstrations.states.shape[1] == expected else ""
+        require(columns == expected, place, f"states of {expected} columns ({self.name})", f"{columns}{advice}")
         fitted = aligned(demonstrations, self.plans.columns, self.plans.units).fitted(self.observed)
         return replace(fitted, state_kinds=self.plans.kinds)
 

@@ -9,9 +9,8 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from ftl_lightning.data.check import Finding, mended
-from ftl_lightning.data.columns import precise
 from ftl_lightning.data.demonstrations import Demonstrations, padded
-from ftl_lightning.data.features import Feature, InitialStates
+from ftl_lightning.data.features import Feature, InitialStates, precise
 from ftl_lightning.domains.domain import OWN, Domain
 from ftl_lightning.services.errors import UserError, short, shown
 

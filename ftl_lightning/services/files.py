@@ -172,7 +172,7 @@ MINARI = re.compile(r"[\w./-]+-v\d+")
 """Pattern of names of Minari data sets."""
 INFO = Path("meta") / "info.json"
 """File that marks a folder as a LeRobot data set."""
-FILES = (".npz", ".safetensors")
+FILES = (".npz", ".safetensors", ".npy", ".json", ".mat", ".h5", ".hdf5", ".pt", ".pth", ".csv", ".parquet")
 """Suffixes of files of demonstrations."""
 
 

@@ -67,6 +67,7 @@ def shipped_name(folder: Path) -> str:
 
 EXTRAS: Mapping[str, Mapping[str, str]] = {
     "driving": {"highway_env": "highway-env", "gymnasium": "gymnasium"},
+    "hdf5": {"h5py": "h5py"},
     "lerobot": {"pyarrow": "pyarrow"},
     "minari": {"minari": "minari"},
     "mocap": {"sklearn": "scikit-learn"},

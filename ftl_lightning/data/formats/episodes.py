@@ -9,8 +9,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ftl_lightning.data.columns import precise
 from ftl_lightning.data.demonstrations import Contents, Demonstrations, padded
+from ftl_lightning.data.features import precise
 from ftl_lightning.services.errors import require, short
 from ftl_lightning.services.files import VARIABLE, most_bytes
 

@@ -12,13 +12,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from ftl_lightning.data.columns import precise
 from ftl_lightning.data.demonstrations import FORMATS, KIND, OBSERVED, Contents, Demonstrations, Format
 from ftl_lightning.services.errors import UserError, about, require, short
-from ftl_lightning.services.files import MOST_TENSORS, check_readable, check_unpacked
+from ftl_lightning.services.files import MOST_TENSORS, check_unpacked
 from ftl_lightning.services.progress import bar
 from ftl_lightning.services.tensor_file import atomic, cache_folder, content_hash, load_tensors, save_tensors
 from ftl_lightning.services.validation import check_type
@@ -32,11 +30,11 @@ MOST_SHRUNK = 1032
 """Maximum compression ratio of zlib."""
 SLOW = 20
 """Minimum number of demonstrations for progress lines without a terminal."""
-_DAMAGED = (
+DAMAGED = (
     *(OSError, ValueError, EOFError, AttributeError, TypeError, RuntimeError, LookupError, MemoryError, SyntaxError),
     *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, tokenize.TokenError),
 )
-"""Exceptions of numpy and zipfile for damaged or foreign files."""
+"""Exceptions of numpy, zipfile and others for damaged or foreign files."""
 
 Tell = Callable[[], None]
 
@@ -59,7 +57,7 @@ def read_safetensors(name: str) -> Contents:
     """
     tensors, header = load_tensors(name, KIND, VERSION)
     with about(name):
-        return _contents(tensors, header)
+        return contents_of(tensors, header)
 
 
 def write_npz(demonstrations: Demonstrations, name: str) -> None:
@@ -70,56 +68,12 @@ def write_npz(demonstrations: Demonstrations, name: str) -> None:
         np.savez(file, **arrays)
 
 
-def read_npz(name: str) -> Contents:
-    """Read an ``.npz`` file without objects. A single text in ``concepts`` is that of all demonstrations.
-
-    Raises:
-        UserError: naming the file, if it is missing, damaged, holds objects, or an array of another type than its key requires.
-    """
-    path = Path(name)
-    size = check_readable(path, "demonstrations")
-    try:
-        check_arrays(path, size)
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {key: np.asarray(archive[key]) for key in archive.files}
-        "".join(text for array in arrays.values() if array.dtype.kind == "U" for text in np.ravel(array)).encode()
-    except _DAMAGED as error:
-        message = short(str(error), 100)
-        raise UserError(f"{path}: expected an .npz of plain arrays, found a damaged file or Python objects ({message})") from error
-    tensors: dict[str, Tensor] = {}
-    header: dict[str, Any] = {}
-    with about(path):
-        for key, array in arrays.items():
-            numeric, actual = array.dtype.kind in "fiub", f"one of {short(str(array.dtype))}"
-            if key.startswith(OBSERVED) or key in ("states", "lengths", "scenes"):
-                require(numeric, f"key {short(key)!r}", "an array of numbers", actual)
-                tensors[key] = _tensor(key, array)
-            elif key in (*TEXTS, "domain"):
-                require(array.dtype.kind == "U", f"key {key!r}", "an array of texts", actual)
-                texts = np.atleast_1d(array).tolist()
-                repeated = len(np.atleast_1d(arrays.get("states", 0))) if key == "concepts" and not array.ndim else 1
-                header[key] = texts[0] if key == "domain" and len(texts) == 1 else texts * repeated
-            elif numeric:
-                tensors[key] = _tensor(key, array)
-        return _contents(tensors, header)
-
-
-def _tensor(key: str, array: NDArray[Any]) -> Tensor:
-    """Convert an array: images stay uint8 and whole lengths int64; other numbers become float32."""
-    if key == "states":
-        return torch.from_numpy(np.array(precise(array), order="C", ndmin=array.ndim))
-    image = array.dtype == np.uint8 and key.startswith(OBSERVED)
-    kind = np.uint8 if image else np.int64 if key == "lengths" and array.dtype.kind in "iu" else np.float32
-    with np.errstate(over="ignore"):  # overflow is reported later as a number that is not finite
-        return torch.from_numpy(np.array(array, dtype=kind, order="C", ndmin=array.ndim))
-
-
 def _header(demonstrations: Demonstrations) -> dict[str, Any]:
     texts = {key: getattr(demonstrations, key) for key in TEXTS}
     return {"domain": demonstrations.domain, **{key: value for key, value in texts.items() if key != "state_kinds" or value}}
 
 
-def _contents(tensors: dict[str, Tensor], header: Mapping[str, Any]) -> Contents:
+def contents_of(tensors: dict[str, Tensor], header: Mapping[str, Any]) -> Contents:
     """Attributes of demonstrations, with defaults for missing keys."""
     names = short(", ".join(tensors)) or "nothing"
     require("states" in tensors, "key 'states'", "(demo, time, state)", f"only {names}")
@@ -218,4 +172,3 @@ def cached(settings: Mapping[str, Any], total: int, make: Callable[[Tell], Demon
 
 
 FORMATS[".safetensors"] = Format(read_safetensors, write_safetensors)
-FORMATS[".npz"] = Format(read_npz, write_npz)

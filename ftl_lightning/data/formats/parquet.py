@@ -1,7 +1,7 @@
 """Numbers and texts in Parquet files. Needs ``pyarrow``: import this module only after the check of the extra."""
 
 import codecs
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from math import prod
 from pathlib import Path
@@ -84,7 +84,7 @@ def read_texts(path: Path, number: str, name: str) -> dict[int, str]:
         require(size <= MOST_TASK_BYTES, str(path), expected, str(size))
         require(file.metadata.num_rows <= MOST_TASKS, str(path), f"at most {MOST_TASKS} tasks", str(file.metadata.num_rows))
         schema = file.schema_arrow
-        texts = [field.name for field in schema if pa.types.is_string(field.type) or pa.types.is_large_string(field.type)]
+        texts = [field.name for field in schema if _is_text(field.type)]
         known = number in schema.names and texts and pa.types.is_integer(schema.field(number).type)
         require(known, str(path), f"the columns {number!r} and {name!r}", short(", ".join(schema.names)))
         columns, decoded = [number, name if name in texts else texts[0]], 0
@@ -117,6 +117,23 @@ def read_lines(path: Path, kinds: Mapping[str, Literal["int64", "string"]]) -> d
     except _DAMAGED as error:
         expected = "a JSON object with " + " and ".join(f"{name!r} ({kind})" for name, kind in kinds.items())
         raise UserError(f"{path}: expected {expected} in each line, found others ({short(str(error), 100)})") from error
+
+
+def read_table(path: Path) -> pd.DataFrame:
+    """Read the columns of numbers and texts of a file; repeated texts are stored once.
+
+    Raises:
+        UserError: naming the file, if it is missing, damaged, or unpacks to far more than its size.
+    """
+    packed = check_readable(path, "Parquet")
+    with _opened(path) as file:
+        texts = [field.name for field in file.schema_arrow if _is_text(field.type)]
+        numbers = [field.name for field in file.schema_arrow if _is_number(field.type)]
+        stored = sum(file.metadata.row_group(group).total_byte_size for group in range(file.num_row_groups))
+        with about(path):
+            check_unpacked(max(stored, 8 * file.metadata.num_rows * (len(texts) + len(numbers))), packed, "columns")
+    with _opened(path, texts) as file:
+        return file.read(columns=[*texts, *numbers]).to_pandas()
 
 
 def write_rows(path: Path, rows: list[dict[str, Any]]) -> None:
@@ -157,9 +174,9 @@ def _to_arrow(values: NDArray[Any]) -> pa.Array:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[pq.ParquetFile]:
+def _opened(path: Path, dictionaries: Sequence[str] = ()) -> Iterator[pq.ParquetFile]:
     try:
-        with pq.ParquetFile(path) as file:
+        with pq.ParquetFile(path, read_dictionary=list(dictionaries)) as file:
             yield file
     except _DAMAGED as error:
         raise UserError(f"{path}: expected a Parquet file, found a damaged one ({short(str(error), 100)})") from error
@@ -181,6 +198,10 @@ def _checked_size(path: Path, file: pq.ParquetFile, shapes: Mapping[str, tuple[i
         require(_is_number(kind), f"{path}: column {name!r}", f"numbers of shape {shape}", short(str(kind)))  # a text has any size
         size += file.metadata.num_rows * prod(shape) * (1 if pa.types.is_uint8(kind) else 8)
     return size
+
+
+def _is_text(kind: pa.DataType) -> bool:
+    return pa.types.is_string(kind) or pa.types.is_large_string(kind)
 
 
 def _is_list(kind: pa.DataType) -> bool:
