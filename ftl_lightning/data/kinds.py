@@ -172,7 +172,7 @@ def declared(names: Sequence[str], of_file: Sequence[str], given: Mapping[str, s
     """
     kinds = list(of_file or ("",) * len(names))
     for key, kind in given.items():
-        for name in (part.strip() for part in key.split(",")):
+        for name in (part.strip() for part in str(key).split(",")):
             require(name in names, place, f"names among {short(', '.join(names), 120)}", repr(short(name)))
             kinds[names.index(name)] = kind
     for kind in kinds:
