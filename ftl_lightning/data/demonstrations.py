@@ -329,7 +329,7 @@ class Demonstrations(Shown):
 
 
 def paths_of(demonstrations: Demonstrations) -> list[Tensor]:
-    """States ``(time, state)`` of each demonstration, without padding."""
+    """States ``(time, state)`` of each of the ``demonstrations``, without padding."""
     return [states[:length] for states, length in zip(demonstrations.states, demonstrations.lengths.tolist(), strict=True)]
 
 
@@ -338,6 +338,11 @@ def held(values: Tensor, lengths: Tensor, continues: float = CONTINUES) -> Tenso
 
     Padding continues a demonstration if it is finite, and no step into it or in it is larger than ``continues`` times the
     largest valid step of its column, as where vehicles drive on.
+
+    Args:
+        values: ``(demo, time, ...)``.
+        lengths: ``(demo,)``, number of valid times.
+        continues: see above; 0 replaces all padding that is not constant.
     """
     times = torch.arange(values.shape[1])
     if not values.is_floating_point() or bool((lengths == len(times)).all()):
