@@ -36,6 +36,7 @@ CLOSEST = {3: 0.5}  # minimum usual distance, as a share of the others' spread, 
 MOST_CHECKED, MOST_LINES = 2000, 2  # demonstrations that are checked before pretraining, and lines of findings
 LEAST_AXIS = 5  # more entries of an axis than this make it a possible time
 SMOOTH_AXIS, EXCHANGED = 0.6, 3.0  # maximum roughness of an exchanged time axis, and minimum ratio of the other's to it
+ROUGH_TIME = 0.9  # minimum roughness along what is no time
 BEYOND = 1.5  # minimum ratio of an outlier's least distance to the others' largest, for five and more
 
 
@@ -153,10 +154,12 @@ def check_each(demonstrations: Demonstrations) -> list[str]:
 def axes(demonstrations: Demonstrations) -> Iterator[Finding]:
     """Find a likely exchange of axes: states are much smoother along demonstrations or columns than along time."""
     shape = tuple(demonstrations.states.shape)
-    if min(shape) < 2 or demonstrations.state_kinds != ():
+    if min(shape) < 2:
         return
     states = demonstrations.states.double()
     demo, time, column = (_roughness(states, axis) for axis in range(3))
+    if not ROUGH_TIME < time < torch.inf:
+        return
     for other, rough, order in ((0, demo, (1, 0, 2)), (2, column, (0, 2, 1))):
         if shape[other] > LEAST_AXIS and rough < SMOOTH_AXIS and time > EXCHANGED * rough:
             suggested = f"(demo, time, column) of shape {tuple(shape[axis] for axis in order)}: transpose{order}"
@@ -168,8 +171,8 @@ def _roughness(states: Tensor, axis: int) -> float:
     """Median over rows of the root mean square step along an axis, relative to the standard deviation along it."""
     steps = states.diff(dim=axis).square().mean(dim=axis).sqrt()
     spread = states.std(dim=axis, correction=0)
-    varies = spread > SAME * states.abs().max()
-    return float((steps[varies] / spread[varies]).median()) if bool(varies.any()) else 0.0
+    varies = spread > SAME * states.abs().amax(dim=axis)
+    return float((steps[varies] / spread[varies]).median()) if bool(varies.any()) else torch.inf
 
 
 def _continuous(demonstrations: Demonstrations) -> tuple[Demonstrations, list[Finding]]:

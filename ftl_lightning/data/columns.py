@@ -8,12 +8,13 @@ import numpy as np
 import torch
 
 from ftl_lightning.data.demonstrations import Demonstrations, paths_of
+from ftl_lightning.data.features import SMOOTH
 from ftl_lightning.services.errors import UserError, note, require, short
 
 LOST = 1e-2
 """The same for float32 files, whose steps are lost beyond; for columns that move smoothly."""
-SMOOTH = 0.8
-"""Minimum correlation of neighbouring values of a column that moves rather than being noise."""
+LARGE = 2.0**14
+"""Minimum number that float32 holds in steps that are no rounding of a constant."""
 LEAST_STEP = 4 * 2.0**-24
 """Minimum median step of a column, as a share of its range, that float32 can hold after scaling."""
 UNITS = {
@@ -41,10 +42,11 @@ def check_precision(demonstrations: Demonstrations) -> None:
             continue
         if demonstrations.states.dtype == torch.float32:
             spacing = float(np.spacing(np.float32(size)))
-            if LOST * width < spacing < width / 4 and _smooth([path[:, column] for path in paths]):
+            far = size >= LARGE or (spacing < width / 4 and _smooth([path[:, column] for path in paths]))
+            if spacing > LOST * width and far:
                 found = f"steps of {spacing:.2g} near {size:.3g}; subtract an offset, or store float64"
                 raise UserError(f"{place}: expected numbers that float32 can hold, found {found}")
-        elif float(moving.median()) < LEAST_STEP * width:
+        elif float(moving.median()) < LEAST_STEP * width and _smooth([path[:, column] for path in paths]):
             found = (
                 f"a median step of {float(moving.median()):.2g} in a range of {width:.3g}; leave the column out, or cut the range"
             )

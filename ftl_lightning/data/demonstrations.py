@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self, TypedDict
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -163,7 +164,8 @@ class Demonstrations(Shown):
         Raises:
             UserError: for arrays of other shapes, or other attributes that do not fit.
         """
-        paths = [torch.as_tensor(path).double() for path in states]
+        require(not any(map(np.ma.is_masked, states)), "states", "every value", "masked values; fill them or leave their times out")
+        paths = [torch.as_tensor(np.asarray(path)).double() for path in states]
         shapes = sorted({tuple(path.shape[1:]) for path in paths})
         fits = len(shapes) == 1 and all(path.dim() == 2 and len(path) for path in paths)
         require(fits, "states", "arrays (time, state) with the same columns", ", ".join(map(str, shapes)) or "none")

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ftl_lightning.services.errors import UserError, require
+from ftl_lightning.services.errors import UserError, require, short
 from ftl_lightning.services.text import Shown
 
 Observed = Mapping[str, Tensor]
@@ -21,6 +21,8 @@ READ = "(read)"  # no user's feature has this name
 
 COARSE = 1e-4
 """Maximum spacing of float32 at a column's largest number, as a share of the column's range; more needs float64."""
+SMOOTH = 0.8
+"""Minimum correlation of neighbouring values of a column that moves rather than being noise."""
 
 
 @dataclass(frozen=True)
@@ -74,18 +76,51 @@ class Feature:
         return (self.kind, self.shape) == (expected.kind, expected.shape)
 
 
-def precise(values: NDArray[Any]) -> NDArray[np.float32] | NDArray[np.float64]:
-    """Convert states ``(..., column)`` to float32, or to float64 if float32 cannot hold how a column varies."""
+def precise(values: NDArray[Any], lengths: Sequence[int] | None = None) -> NDArray[np.float32] | NDArray[np.float64]:
+    """Convert states ``(demo, time, column)`` to float32, or to float64 if float32 cannot hold how a column varies.
+
+    Args:
+        values: numbers of any type; float32 stays float32.
+        lengths: number of valid times of each demonstration; ``None`` for all.
+    """
     with np.errstate(over="ignore", invalid="ignore"):  # overflow is reported later as a number that is not finite
         single = np.asarray(values, dtype=np.float32)
-        if values.dtype.itemsize <= 4 or values.dtype.kind not in "fiu" or not values.size or values.ndim < 2:
+        short_float = values.dtype.kind == "f" and values.dtype.itemsize <= 4
+        if short_float or values.dtype.kind not in "fiu" or values.ndim < 2 or not values.size:
             return single
-        flat = np.asarray(values, dtype=np.float64).reshape(-1, values.shape[-1])
-        finite = np.isfinite(flat)
-        low, high = np.where(finite, flat, np.inf).min(axis=0), np.where(finite, flat, -np.inf).max(axis=0)
-        spacing = np.spacing(np.maximum(np.abs(low), np.abs(high)).astype(np.float32)).astype(np.float64)
-        coarse = (spacing > COARSE * (high - low)) & (high - low > 1e-12 * np.maximum(np.abs(low), np.abs(high)))
+        exact = np.asarray(values, dtype=np.float64).reshape(*(values.shape[:2] if values.ndim > 2 else (1, len(values))), -1)
+        valid = np.isfinite(exact)
+        if lengths is not None and len(lengths) == len(exact):
+            valid &= (np.arange(exact.shape[1]) < np.asarray(lengths)[:, None])[..., None]
+        low, high = np.where(valid, exact, np.inf).min(axis=1), np.where(valid, exact, -np.inf).max(axis=1)  # (demo, column)
+        size = np.where(valid, np.abs(exact), 0).max(axis=(0, 1), initial=0)
+        whole = high.max(axis=0, initial=-np.inf) - low.min(axis=0, initial=np.inf)
+        within = (high - low).max(axis=0, initial=0)
+        within = np.where(_moves(exact, valid), within, whole)  # noise within demonstrations is no movement
+        coarse = (np.spacing(size.astype(np.float32)).astype(np.float64) > COARSE * within) & (within > 1e-12 * size)
     return np.asarray(values, dtype=np.float64) if coarse.any() else single
+
+
+def _moves(exact: NDArray[np.float64], valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Whether columns of ``(demo, time, column)`` move smoothly within demonstrations: neighbouring values are correlated."""
+    count = valid.sum(axis=1, keepdims=True)
+    centred = np.where(valid, exact - np.where(valid, exact, 0).sum(axis=1, keepdims=True) / np.maximum(count, 1), 0)
+    products, squares = (centred[:, 1:] * centred[:, :-1]).sum(axis=(0, 1)), np.square(centred).sum(axis=(0, 1))
+    return np.asarray((squares > 0) & (products > SMOOTH * squares))
+
+
+def check_single(key: str, values: NDArray[Any]) -> None:
+    """Refuse numbers whose differences float32 cannot hold; ``UserError`` with the key.
+
+    Args:
+        key: key of the numbers.
+        values: ``(demo, ...)`` or ``(demo, time, ...)``.
+    """
+    flat = values.reshape(len(values), -1) if values.ndim else values
+    if values.ndim and values.dtype != np.uint8 and precise(flat).dtype == np.float64:
+        size = float(np.nanmax(np.abs(flat)))
+        found = f"steps of {np.spacing(np.float32(size)):.2g} near {size:.3g}; subtract an offset"
+        raise UserError(f"key {short(key)!r}: expected numbers that float32 can hold, found {found}")
 
 
 def take(observed: Observed, rows: Tensor | Sequence[int] | slice | int) -> dict[str, Tensor]:

@@ -24,12 +24,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ftl_lightning.services.errors import require, short
+from ftl_lightning.services.errors import require, short, shown
 
 LINEAR, ANGLE, QUATERNION, ROTATION, BINARY, CATEGORY = KINDS = (
     *("linear", "angle", "quaternion", "rotation", "binary", "category"),
 )
-TURNS = {"rad": 2 * math.pi, "deg": 360.0}
+TURNS = dict.fromkeys(("rad", "radian", "radians"), 2 * math.pi) | dict.fromkeys(("deg", "degree", "degrees", "°"), 360.0)
 """A whole turn by unit."""
 UNIT_NORM = 1e-3
 """Maximum error of the norm of a quaternion, or of a row of a rotation matrix, and of their products."""
@@ -201,8 +201,8 @@ def resolved(
     groups: list[Group] = []
     column = 0
     while column < len(names):
-        group = _declared_group(paths, every, names, units, kinds, column, place) if kinds[column] else None
-        group = group or _proposed(paths, every, units, kinds, column)
+        group = _declared_group(paths, every, names, units, kinds, column, place) if kinds[column].strip() else None
+        group = group or _proposed(paths, every, names, units, kinds, column)
         groups.append(group)
         column += group.count
     return tuple(text for group in groups for text in group.texts) if any(group.kind != LINEAR for group in groups) else ()
@@ -211,74 +211,116 @@ def resolved(
 def _groups(kinds: Sequence[str]) -> Iterator[Group]:
     column = 0
     while column < len(kinds):
-        kind, *rest = kinds[column].split()
-        numbers = tuple(map(float, rest))
-        group = Group(kind, column, _size(kind, numbers), numbers)
+        group = _resolved(kinds, column)
+        whole = group is not None and kinds[column : column + group.count] == group.texts
+        require(whole, f"key 'state_kinds': entry {column}", "a resolved kind of each column of its group", shown(kinds[column]))
+        assert group is not None
         yield group
         column += group.count
 
 
-def _size(kind: str, numbers: Sequence[float]) -> int:
-    """Number of columns of a resolved kind."""
-    return {QUATERNION: 4}.get(kind) or (int(numbers[0]) if kind in (CATEGORY, ROTATION) else 1)
+def _resolved(kinds: Sequence[str], first: int) -> Group | None:
+    """Group of a resolved kind; ``None`` for a kind without its numbers, or with others."""
+    kind, *rest = kinds[first].split() or [""]
+    try:
+        numbers = tuple(map(float, rest))
+    except ValueError:
+        return None
+    fits = {
+        LINEAR: not numbers,
+        ANGLE: len(numbers) == 3 and numbers[1] > 0,
+        QUATERNION: len(numbers) == 2 and numbers[0] in range(4) and abs(numbers[1]) == 1,
+        ROTATION: numbers in ((6.0,), (9.0,)),
+        BINARY: len(numbers) == 2 and numbers[0] < numbers[1],
+        CATEGORY: len(numbers) == 1 and numbers[0] in range(2, len(kinds) + 1),
+    }
+    if not fits.get(kind) or not all(map(math.isfinite, numbers)):
+        return None
+    count = 4 if kind == QUATERNION else int(numbers[0]) if kind in (CATEGORY, ROTATION) else 1
+    return Group(kind, first, count, numbers)
+
+
+def check_values(paths: Sequence[Tensor], names: Sequence[str], kinds: Sequence[str]) -> None:
+    """Refuse values that contradict the resolved kinds of a model; ``UserError`` with the column."""
+    every = torch.cat(list(paths)).double()
+    for group in Columns(kinds).groups:
+        values = every[:, group.columns]
+        place = f"column {short(names[group.first], 40)!r}"
+        if group.kind == QUATERNION:
+            require(_unit(values), place, "quaternions of norm 1, as the model's", "others")
+        elif group.kind == ROTATION:
+            require(_orthonormal(values), place, "orthonormal rows, as the model's", "others")
+        elif group.kind == CATEGORY:
+            one_hot = bool(((values == 0) | (values == 1)).all()) and bool((values.sum(dim=1) == 1).all())
+            require(one_hot, place, "one-hot columns, as the model's", "others")
+        elif group.kind == BINARY:
+            known = bool(torch.isin(values, torch.tensor(group.numbers, dtype=torch.double)).all())
+            require(known, place, f"{group.numbers[0]:g} or {group.numbers[1]:g}, as the model's", "other values")
 
 
 def _declared_group(
     paths: Sequence[Tensor], every: Tensor, names: Sequence[str], units: Sequence[str], kinds: Sequence[str], first: int, place: str
 ) -> Group:
-    kind, *rest = kinds[first].split()
-    run = next((at for at in range(first, len(kinds)) if kinds[at] != kinds[first]), len(kinds)) - first
-    if rest:  # resolved before
-        numbers = tuple(map(float, rest))
-        return Group(kind, first, _size(kind, numbers), numbers)
+    kind = kinds[first].split()[0]
+    words = [text.split()[0] if text.split() else "" for text in kinds]
+    run = next((at for at in range(first, len(kinds)) if words[at] != kind), len(kinds)) - first
     what = f"{place}: column {short(names[first], 40)!r}"
     if kind == ANGLE:
-        return Group(kind, first, 1, _turn(paths, first, TURNS.get(units[first], 0.0)))
+        return _resolved(kinds, first) or Group(
+            kind, first, 1, _turn(paths, first, TURNS.get((kinds[first].split()[1:] or [units[first]])[0], 0.0))
+        )
     if kind == QUATERNION:
         require(run % 4 == 0, what, "4 columns of a quaternion", f"{run} in a row")
         require(_unit(every[:, first : first + 4]), what, "quaternions of norm 1", "others; normalise them")
         return Group(kind, first, 4, _sign(paths, first))
     if kind == ROTATION:
-        size = next((size for size in (9, 6) if run % size == 0), 0)
-        require(size, what, "9 columns of a rotation matrix, or its first two rows (6)", f"{run} in a row")
-        require(_orthonormal(every[:, first : first + size]), what, "orthonormal rows with determinant 1", "others")
+        require(run >= 6, what, "9 columns of a rotation matrix, or its first two rows (6)", f"{run} in a row")
+        size = next((size for size in (9, 6) if run >= size and _orthonormal(every[:, first : first + size])), 0)
+        require(size, what, "orthonormal rows with determinant 1", "others")
         return Group(kind, first, size, (size,))
     if kind == BINARY:
         values = every[:, first].unique().tolist()
+        values = [0.0, 1.0] if values in ([0.0], [1.0]) else values
         require(len(values) == 2, what, "two values", f"{len(values)}")
         return Group(kind, first, 1, tuple(values))
     if kind == CATEGORY:
-        size = _one_hot(every, first, run)
+        size = _one_hot(every, first, run, declared=True)
         require(size, what, "columns of 0 and 1 of which one is 1 at each time (one-hot)", "others")
         return Group(kind, first, size, (size,))
     return Group(LINEAR, first, 1)
 
 
-def _proposed(paths: Sequence[Tensor], every: Tensor, units: Sequence[str], kinds: Sequence[str], first: int) -> Group:
+def _proposed(
+    paths: Sequence[Tensor], every: Tensor, names: Sequence[str], units: Sequence[str], kinds: Sequence[str], first: int
+) -> Group:
     """Group from ``first`` on that the data show, among columns without a declared kind; linear if they show none."""
-    free = next((at for at in range(first, len(kinds)) if kinds[at]), len(kinds)) - first
+    free = next((at for at in range(first, len(kinds)) if kinds[at].strip()), len(kinds)) - first
     rest = every[:, first : first + free]
     if free >= 2 and (size := _one_hot(every, first, free)):
         return Group(CATEGORY, first, size, (size,))
     if free >= 9 and _orthonormal(rest[:, :9]) and _moves(rest[:, :9]):
         return Group(ROTATION, first, 9, (9,))
-    if free >= 4 and _unit(rest[:, :4]) and _moves(rest[:, :4], 2):
+    if free >= 4 and _is_quaternion([path[:, first : first + 4] for path in paths], names[first : first + 4]):
         return Group(QUATERNION, first, 4, _sign(paths, first))
     if free and tuple(rest[:, 0].unique()[:3].tolist()) in PAIRS:
         return Group(BINARY, first, 1, tuple(rest[:, 0].unique().tolist()))
-    for unit, turn in TURNS.items():
-        if free and units[first] in ("", unit) and wraps([path[:, first] for path in paths], turn):
+    for turn in dict.fromkeys(TURNS.values()):
+        if (
+            TURNS.get(units[first], turn) == turn
+            and (not units[first] or units[first] in TURNS)
+            and wraps([path[:, first] for path in paths], turn)
+        ):
             return Group(ANGLE, first, 1, _turn(paths, first, turn))
     return Group(LINEAR, first, 1)
 
 
 def wraps(columns: Sequence[Tensor], turn: float) -> bool:
-    """Whether angles ``(time,)`` of several demonstrations fill a turn, and jump from end to end in rare steps."""
+    """Whether angles ``(time,)`` of demonstrations fill a turn, and jump from end to end in rare steps."""
     values, steps = torch.cat(list(columns)), [column.diff().abs() for column in columns]
     width, sizes = float(values.max() - values.min()) / turn, torch.cat(steps)
     moving = sizes[sizes > 0]
     jumps = [int((part > WRAPPED * turn).sum()) for part in steps]
-    if not TURN[0] <= width <= TURN[1] or sum(1 for count in jumps if count) < 2:
+    if not TURN[0] <= width <= TURN[1] or not any(jumps):
         return False
     return sum(jumps) * RARE < len(moving) and float(sizes.max()) > 2 * RARE * float(moving.median())
 
@@ -287,8 +329,12 @@ def _turn(paths: Sequence[Tensor], column: int, turn: float) -> tuple[float, flo
     """Lowest value, whole turn (by the range of values unless given), and 1 if paths wrap."""
     values = torch.cat([path[:, column] for path in paths]).double()
     turn = turn or (360.0 if float(values.abs().max()) > 2 * TURNS["rad"] else TURNS["rad"])
-    jumps = any(bool((path[:, column].diff().abs() > turn / 2).any()) for path in paths)
-    return (0.0 if float(values.min()) >= 0 else -turn / 2), turn, float(jumps or float(values.max() - values.min()) <= turn)
+    columns = [path[:, column].double() for path in paths]
+    wraps = any(bool((column.diff().abs() > turn / 2).any()) for column in columns)
+    for low in (-turn / 2, 0.0, float(values.min())):
+        if low <= float(values.min()) and float(values.max()) <= low + turn:
+            return low, turn, 1.0
+    return (float(values.min()) if wraps else min(float(column[0]) for column in columns)), turn, float(wraps)
 
 
 def _sign(paths: Sequence[Tensor], first: int) -> tuple[float, float]:
@@ -316,16 +362,36 @@ def _moves(values: Tensor, least: int = 1) -> bool:
     return int((values.amax(dim=0) - values.amin(dim=0) > UNIT_NORM).sum()) >= least
 
 
-def _one_hot(every: Tensor, first: int, most: int) -> int:
-    """Number of adjacent columns from ``first`` on, at most ``most``, that are one-hot and vary; 0 without any."""
+def _is_quaternion(paths: Sequence[Tensor], names: Sequence[str]) -> bool:
+    """Whether columns ``(time, 4)`` of norm 1 are quaternions: by names, changes of sign, or no part of constant norm."""
+    every = torch.cat(list(paths)).double()
+    if not _unit(every) or not _moves(every, 2):
+        return False
+    if any(bool(((path[1:] * path[:-1]).sum(dim=-1) < -0.5).any()) for path in paths):
+        return True
+    letters = [name.lower().strip("_. ")[-1:] for name in names]
+    if sorted(letters) == ["w", "x", "y", "z"] and all("q" in name.lower() or "rot" in name.lower() for name in names):
+        return True
+    squares = every.square()
+    subsets = [[column] for column in range(4)] + [[0, column] for column in range(1, 4)]
+    varied = all(float(squares[:, subset].sum(dim=1).std()) > UNIT_NORM for subset in subsets)
+    return varied and bool((every < -UNIT_NORM).any()) and bool((every > UNIT_NORM).any())
+
+
+def _one_hot(every: Tensor, first: int, most: int, declared: bool = False) -> int:
+    """Number of adjacent columns from ``first`` on, at most ``most``, that are one-hot; 0 without any.
+
+    A proposed group varies, and begins with a column that is used; a declared group includes columns that are never used.
+    """
     columns = every[:, first : first + most]
     zero_or_one = ((columns == 0) | (columns == 1)).all(dim=0).tolist()
     width = next((at for at, binary in enumerate(zero_or_one) if not binary), len(zero_or_one))
     sums = columns[:, :width].cumsum(dim=1)
-    for size in range(2, width + 1):
-        if bool((sums[:, size - 1] == 1).all()):
-            return size if bool(columns[:, :size].any(dim=0).sum() > 1) else 0
-    return 0
+    sizes = [size for size in range(2, width + 1) if bool((sums[:, size - 1] == 1).all())]
+    if declared or not sizes:
+        return max(sizes, default=0)
+    used = columns[:, : sizes[0]].any(dim=0)
+    return sizes[0] if bool(used[0]) and int(used.sum()) > 1 else 0
 
 
 def _rows(quaternions: Tensor) -> Tensor:

@@ -206,8 +206,9 @@ def of_kinds(demonstrations: Demonstrations, kinds: Mapping[str, str], place: st
     names, units = demonstrations.state_names, demonstrations.state_units
     given = declared(names, demonstrations.state_kinds, kinds, f"{place}: data.kinds")
     found = resolved(paths_of(demonstrations), names, units, given, place)
-    for text in Columns(found).notes(names):
-        note(f"{place}: {text}; data.kinds declares others")
+    if not any(given):
+        for text in Columns(found).notes(names):
+            note(f"{place}: {text}; data.kinds declares others")
     return replace(demonstrations, state_kinds=found)
 
 

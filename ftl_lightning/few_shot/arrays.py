@@ -10,9 +10,9 @@ from torch import Tensor
 
 from ftl_lightning.data.check import Finding, mended
 from ftl_lightning.data.demonstrations import Demonstrations, padded
-from ftl_lightning.data.features import Feature, InitialStates, precise
+from ftl_lightning.data.features import Feature, InitialStates, check_single, precise
 from ftl_lightning.domains.domain import OWN, Domain
-from ftl_lightning.services.errors import UserError, short, shown
+from ftl_lightning.services.errors import UserError, require, short, shown
 
 Start = InitialStates | Mapping[str, ArrayLike] | ArrayLike
 """Initial states, observed features by name, or values ``(sample, *shape)`` of the only feature."""
@@ -39,6 +39,7 @@ def demonstrations_of(
         # Without time, every row is a demonstration.
         index, what = ("[:, None]", "demonstrations") if domain.plans.horizon == 1 else ("[None]", "a single demonstration")
         advice = f"; give {what} as states{index}" if tuple(whole.shape[1:]) == (columns,) else ""
+        advice = "; exchange axes 1 and 2" if whole.dim() == 3 and whole.shape[1] == columns else advice
         raise UserError(f"states: expected shape (demo, time, {columns}), found {tuple(whole.shape)}{advice}")
     features, per_step = {}, []
     for key, values in _by_name(observed, domain.observed).items():
@@ -46,13 +47,15 @@ def demonstrations_of(
         part = _padded(f"observed {key!r}", values)[0]
         if part.dim() == len(feature.shape) + 2:
             per_step.append(key)
+        if feature.kind == "vector":
+            check_single(f"observed/{key}", part.numpy())
         features[key] = part.float() if feature.kind == "vector" else part
     return domain.fitted(
         Demonstrations(
             states=torch.from_numpy(precise(whole.numpy())),
             lengths=lengths,
             domain=domain.name,
-            state_names=domain.plans.columns,
+            state_names=_names(states) or domain.plans.columns,
             state_units=domain.plans.units,
             concepts=(name,) * len(whole),
             observed=features,
@@ -78,7 +81,7 @@ def mended_states(
     given, lengths = _padded("states", states)
     if given.dim() != 3:
         return states, ()
-    whole, findings = mended(given.float(), lengths)
+    whole, findings = mended(torch.from_numpy(precise(given.numpy(), lengths.tolist())), lengths)
     return [path[:length].numpy() for path, length in zip(whole, lengths.tolist(), strict=True)], findings
 
 
@@ -133,6 +136,14 @@ def scenes_of(given: ArrayLike) -> Tensor:
             f"found {shown(given)}"
         )
     return scenes
+
+
+def _names(states: Any) -> tuple[str, ...]:
+    """Names of the columns of data frames; empty for other arrays."""
+    frames = [states] if hasattr(states, "columns") else states if isinstance(states, list | tuple) else []
+    names = {tuple(map(str, frame.columns)) for frame in frames if hasattr(frame, "columns")}
+    require(len(names) < 2, "states", "data frames with the same columns", f"{len(names)} different lists")
+    return next(iter(names), ())
 
 
 def tensor_of(key: str, values: Any) -> Tensor:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.data.check import Finding, check
-from ftl_lightning.data.demonstrations import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations, paths_of
 from ftl_lightning.data.features import moved
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import Concept
@@ -217,7 +217,8 @@ def outside(model: ConceptModel, demonstrations: Demonstrations) -> Tensor:
 def _scale(model: ConceptModel, demonstrations: Demonstrations) -> Iterator[Finding]:
     columns, view = model.domain.plans.columns, model.view
     values = outside(model, demonstrations).abs()
-    named = view is None or view.same_columns
+    columns = view.columns if view is not None and view.columns else columns
+    named = view is None or view.same_columns or bool(view.columns)
     names = columns if named and len(columns) == len(values) else [f"{column} of the model's view" for column in range(len(values))]
     yield from _range_finding("states", values, names)
     vectors = model.vectors(moved(demonstrations.initial_states.observed, model.device))
@@ -226,7 +227,8 @@ def _scale(model: ConceptModel, demonstrations: Demonstrations) -> Iterator[Find
         yield from _range_finding("observed vectors", vectors.abs().T.cpu(), numbers)
     if named and len(columns) == len(values):
         low, high = model.normalization.low.cpu(), model.normalization.high.cpu()
-        every = torch.cat([states[:length] for states, length in zip(demonstrations.states, demonstrations.lengths, strict=True)])
+        every = torch.cat(paths_of(demonstrations))
+        every = view.encode(every, {}) if view is not None and view.columns else every
         resolution = max(model.domain.plans.resolution, 1e-3)
         differs = (every - low).abs().amax(dim=0) > resolution * low.abs().clamp(min=1)
         lost = [name for name, hidden in zip(columns, ((high <= low) & differs).tolist(), strict=True) if hidden]

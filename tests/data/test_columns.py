@@ -17,6 +17,7 @@ from tests.tiny import QUIET
 
 FIT = ["fit", f"--config={CONF / 'own.yaml'}", "--trainer.max_steps=3", *QUIET]
 KINDS = list(TRAINING)[:2]
+RAMP = np.linspace(0, 1, 40)
 
 
 def some(**changes: object) -> Demonstrations:
@@ -53,7 +54,7 @@ def test_large_offsets_are_kept_in_float64_and_samples_move(offset: float) -> No
     ("states", "column"),
     [
         (np.float32(5_820_000) + strokes("heart", 5, 0).astype(np.float32), "x"),  # steps are lost in the file
-        (np.stack((np.linspace(0, 1, 40), np.r_[np.arange(39) * 1e-9, 1.0]), axis=-1)[None].repeat(5, 0) + np.array([0, 1e4]), "y"),
+        (np.stack((RAMP, np.r_[np.arange(25) * 1e-9, RAMP[25:]]), axis=-1)[None].repeat(5, 0) + np.array([0, 1e4]), "y"),
     ],
 )
 def test_steps_that_float32_cannot_hold_are_refused_with_the_column(states: np.ndarray, column: str) -> None:

@@ -29,7 +29,7 @@ import torch
 from numpy.typing import NDArray
 
 from ftl_lightning.data.demonstrations import FORMATS, OBSERVED, Contents, Demonstrations, Format, padded
-from ftl_lightning.data.features import precise
+from ftl_lightning.data.features import check_single, precise
 from ftl_lightning.data.formats.files import DAMAGED, TEXTS, check_arrays, contents_of, write_npz
 from ftl_lightning.services.errors import UserError, about, note, require, short
 from ftl_lightning.services.files import check_readable, check_unpacked
@@ -39,7 +39,11 @@ from ftl_lightning.services.validation import read_json
 Arrays = dict[str, NDArray[Any]]
 NUMBERS = ("states", "lengths", "scenes")
 """Keys of arrays of numbers, besides observed features."""
-EPISODE, TIME, CONCEPT = ("demonstration", "demo", "episode", "episode_index"), ("time", "step", "frame_index"), ("concept", "task")
+EPISODE, TIME, CONCEPT = (
+    ("demonstration", "demo", "episode", "episode_index"),
+    ("time", "step", "frame_index", "timestamp"),
+    ("concept", "task"),
+)
 """Names of the columns of a table that are no columns of a state."""
 CHANNELS, LEAST_SIDE = (1, 3, 4), 8
 """Numbers of channels of an image, and minimum side for numbers to be an image."""
@@ -63,7 +67,8 @@ def contents_of_arrays(arrays: Mapping[str, NDArray[Any]], place: str) -> Conten
         if key.startswith(OBSERVED) or key in NUMBERS:
             require(array.dtype.kind in "fiub", f"key {short(key)!r}", "an array of numbers", found)
             per_step = key.removeprefix(OBSERVED) in _texts(arrays.get("per_step"))
-            tensors[key] = tensor_of(key, _image(place, key, array, 2 if per_step else 1) if key.startswith(OBSERVED) else array)
+            values = _image(place, key, array, 2 if per_step else 1) if key.startswith(OBSERVED) else array
+            tensors[key] = tensor_of(key, values, arrays.get("lengths"))
         elif key in (*TEXTS, "domain"):
             texts = _texts(array)
             require(texts or not array.size, f"key {key!r}", "an array of texts", found)
@@ -74,21 +79,25 @@ def contents_of_arrays(arrays: Mapping[str, NDArray[Any]], place: str) -> Conten
     return contents_of(tensors, header)
 
 
-def tensor_of(key: str, array: NDArray[Any]) -> torch.Tensor:
+def tensor_of(key: str, array: NDArray[Any], lengths: NDArray[Any] | None = None) -> torch.Tensor:
     """Convert an array: images stay uint8, whole lengths int64, states float64 where float32 loses steps; others float32."""
     if key == "states":
-        return torch.from_numpy(np.array(precise(array), order="C", ndmin=array.ndim))
+        each = None if lengths is None else np.ravel(lengths).tolist()
+        return torch.from_numpy(np.array(precise(array, each), order="C", ndmin=array.ndim))
+    if key.startswith(OBSERVED):
+        check_single(key, array)
     image = array.dtype == np.uint8 and key.startswith(OBSERVED)
     kind = np.uint8 if image else np.int64 if key == "lengths" and array.dtype.kind in "iu" else np.float32
     with np.errstate(over="ignore"):  # overflow is reported later as a number that is not finite
         return torch.from_numpy(np.array(array, dtype=kind, order="C", ndmin=array.ndim))
 
 
-def _texts(array: NDArray[Any] | None) -> list[str]:
+def _texts(array: NDArray[Any] | None) -> list[Any]:
     """Texts of an array of texts, or of bytes in UTF-8; empty for other arrays."""
     if array is None or array.dtype.kind not in "US":
         return []
-    return [part.decode("utf-8") if isinstance(part, bytes) else part for part in np.atleast_1d(array).ravel().tolist()]
+    texts: list[Any] = np.atleast_1d(array if array.dtype.kind == "U" else np.char.decode(array, "utf-8")).tolist()
+    return texts
 
 
 def _nearest(key: str) -> str:
@@ -139,7 +148,8 @@ def _read(name: str, kind: str, load: Callable[[Path, int], Arrays]) -> Contents
         with about(path):
             arrays = load(path, size)
     except (*DAMAGED, ImportError) as error:
-        raise UserError(f"{path}: expected {kind}, found a damaged or foreign file ({short(str(error), 100)})") from error
+        message = f"a damaged or foreign file, or objects ({short(str(error), 100)})"
+        raise UserError(f"{path}: expected {kind}, found {message}") from error
     with about(path):
         return contents_of_arrays(arrays, name)
 
@@ -235,6 +245,14 @@ def _of_table(table: Any, path: Path) -> Arrays:
     episode, time, concept = (
         next((columns[name] for name in names if name in columns), None) for names in (EPISODE, TIME, CONCEPT)
     )
+    for name in [name for name in table.columns if str(name).startswith("Unnamed:")]:
+        note(f"{path}: column {short(str(name))!r} without a name is not read")
+        table = table.drop(columns=name)
+    if episode is not None:
+        whole = not bool(table[episode].isna().any())
+        require(whole, f"column {episode!r}", "the demonstration of every row", "empty cells; fill them down")
+    if time is not None and episode is not None and bool(table.duplicated([episode, time]).any()):
+        note(f"{path}: several rows of a demonstration have the same {time!r}")
     if episode is None:
         note(f"{path}: no column {EPISODE[0]!r}, so all rows are a single demonstration")
     numeric = [name for name in table.columns if name not in (episode, time, concept) and table[name].dtype.kind in "fiub"]
