@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ftl_lightning.data.features import Feature, InitialStates, Observed, precise, take
 from ftl_lightning.services.errors import UserError, about, require, short
-from ftl_lightning.services.files import MOST_RATIO, MOST_UNPACKED, raised, read_from, written_to
+from ftl_lightning.services.files import MOST_RATIO, MOST_TENSORS, MOST_UNPACKED, raised, read_from, written_to
 from ftl_lightning.services.tensor_file import bytes_hash, serialise
 from ftl_lightning.services.text import Shown, counted
 
@@ -395,12 +395,13 @@ def stacked(states: Sequence[Any]) -> tuple[Tensor, Tensor]:
     Raises:
         UserError: for arrays of other shapes or types.
     """
-    require(len(states), "states", "an array (time, state) for each demonstration", "none")
+    require(0 < len(states) <= MOST_TENSORS, "states", f"1 to {MOST_TENSORS} arrays (time, state)", str(len(states)))
     arrays: list[NDArray[np.float64]] = []
     for index, path in enumerate(states):
         try:
             array = np.asarray(path.detach().cpu().double() if isinstance(path, Tensor) else path)
-            require(array.dtype.kind in "fiub", f"states[{index}]", "numbers (time, state)", str(array.dtype))
+            found = "other values" if array.dtype.kind == "O" else str(array.dtype)
+            require(array.dtype.kind in "fiub", f"states[{index}]", "numbers (time, state)", found)
         except (ValueError, TypeError, RuntimeError) as error:
             raise UserError(f"states[{index}]: expected numbers (time, state), found others ({short(str(error))})") from error
         columns = f"{arrays[0].shape[1]} columns" if arrays else "columns"

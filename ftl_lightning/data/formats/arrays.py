@@ -18,9 +18,7 @@ file                   content
 
 import difflib
 import math
-import struct
 import zipfile
-import zlib
 from collections.abc import Callable, Collection, Iterator, Mapping
 from functools import partial
 from pathlib import Path
@@ -34,8 +32,9 @@ from numpy.typing import NDArray
 from ftl_lightning.data.demonstrations import FORMATS, OBSERVED, Contents, Demonstrations, Format, gathered, stacked
 from ftl_lightning.data.features import precise
 from ftl_lightning.data.formats.files import DAMAGED, TEXTS, check_array, check_arrays, contents_of, write_npz
+from ftl_lightning.data.formats.matlab import check_matlab
 from ftl_lightning.services.errors import UserError, about, note, require, short
-from ftl_lightning.services.files import MOST_HEADER, MOST_TENSORS, check_readable, check_unpacked, raised
+from ftl_lightning.services.files import MOST_HEADER, check_readable, check_unpacked, raised
 from ftl_lightning.services.shipped import check_extra
 from ftl_lightning.services.validation import read_json
 
@@ -55,8 +54,8 @@ UNREAD = np.zeros(0)
 """In place of an array whose name is unknown."""
 MOST_NOTES = 5
 """Maximum number of arrays or columns that are noted by name."""
-COMPRESSED = 15
-"""Type of a compressed element of a MATLAB file."""
+MOST_COLUMNS = 2000
+"""Maximum number of columns of a table."""
 CELL = 1000
 """Bytes of a cell of MATLAB in memory."""
 CHANNELS, LEAST_SIDE = (1, 3, 4), 8
@@ -140,8 +139,9 @@ def array_of(value: Any) -> NDArray[Any]:
     if isinstance(value, list | tuple) and any(isinstance(part, torch.Tensor) for part in value):
         parts = [array_of(part) for part in value]
         objects = np.empty(len(parts), dtype=object)
-        objects[:] = parts if len({part.shape for part in parts}) > 1 else None
-        return objects if objects.any() else np.stack(parts)
+        for index, part in enumerate(parts):
+            objects[index] = part
+        return objects if len({part.shape for part in parts}) > 1 else np.stack(parts)
     objects = np.array(value, dtype=object)
     kinds = set(map(type, objects.ravel()))
     return objects.astype(np.float64 if float in kinds else np.int64) if kinds <= {int, float, bool} else objects
@@ -249,18 +249,23 @@ def _json(path: Path, size: int) -> Arrays:
 
 def _mat(path: Path, size: int) -> Arrays:
     from scipy.io import loadmat, whosmat
-    from scipy.io.matlab import matfile_version
+    from scipy.io.matlab import MatReadError, matfile_version
 
-    version = matfile_version(path)[0]
+    try:
+        version = matfile_version(path)[0]
+    except MatReadError as error:
+        raise ValueError(str(error)) from error
     require(version < 2, "version", "MATLAB up to version 7", "7.3; save it with save('FILE', ..., '-v7')")
     if version:
-        _check_inflated(path, size)
+        check_matlab(path, size, lambda name: _is_known(name) or name == "observed")
     variables = whosmat(path)
     sizes = (math.prod(shape) * (CELL if kind in ("cell", "struct") else 8) for _, shape, kind in variables)
     check_unpacked(sum(sizes), size, "variables")
     known = [name for name, _, _ in variables if _is_known(name) or name == "observed"]
     content = loadmat(path, variable_names=known) if known else {}
     arrays: Arrays = {name: content[name] if _is_known(name) else UNREAD for name, _, _ in variables}
+    for name, array in content.items():
+        require(name.startswith("__") or isinstance(array, np.ndarray), f"key {short(name)!r}", "an array", "a sparse matrix")
     record = content.get("observed", UNREAD)
     if record.dtype.names and record.size == 1:
         del arrays["observed"]
@@ -271,21 +276,6 @@ def _mat(path: Path, size: int) -> Arrays:
         elif name == "lengths" or array.dtype.kind == "O":
             arrays[name] = array.reshape(-1)
     return arrays
-
-
-def _check_inflated(path: Path, size: int) -> None:
-    """Refuse a MATLAB file of version 5 to 7 whose compressed variables are much larger than the file."""
-    total = 0
-    with path.open("rb") as file:
-        order = "<" if file.read(128)[126:] == b"IM" else ">"
-        while len(tag := file.read(8)) == 8:
-            kind, count = struct.unpack(f"{order}II", tag)
-            content, reader = file.read(min(count, size)), zlib.decompressobj()
-            while kind == COMPRESSED and content:
-                part = reader.decompress(content, MOST_HEADER)
-                total += len(part)
-                check_unpacked(total, size, "variables")
-                content = reader.unconsumed_tail
 
 
 def _of_matlab(value: Any) -> Any:
@@ -337,9 +327,11 @@ def _csv(path: Path, size: int) -> Arrays:
 
     with path.open("rb") as file:
         most = max((line.count(b",") for line in file), default=0)
-    require(most < MOST_TENSORS, "columns", f"at most {MOST_TENSORS}", str(most + 1))
+    require(most < MOST_COLUMNS, "columns", f"at most {MOST_COLUMNS}", str(most + 1))
     table = pd.read_csv(path.absolute(), compression=None, low_memory=False)
-    require(isinstance(table.index, pd.RangeIndex), "line 2", f"{len(table.columns)} values, as many as names", "more")
+    require(
+        isinstance(table.index, pd.RangeIndex), "line 2", f"{len(table.columns)} values between commas, as many as names", "more"
+    )
     number = next((name for name in table.columns if not name.isdigit() and _is_number(name)), None)
     require(number is None, "line 1", "names of columns", f"the number {short(str(number))}; add a line of names")
     return _of_table(table, path)
@@ -366,38 +358,43 @@ def _of_table(table: "pd.DataFrame", path: Path) -> Arrays:
     """Arrays of a table with a row for each time of each demonstration."""
     import pandas as pd
 
-    table = table.dropna(how="all")
-    require(len(table), "rows", "one for each time", "none")
+    require(len(table.columns) <= MOST_COLUMNS, "columns", f"at most {MOST_COLUMNS}", str(len(table.columns)))
+    if len(table.columns) > 1 and (empty := int(table.isna().all(axis=1).sum())):
+        note(f"{path}: {empty} empty rows are left out")
+        table = table.dropna(how="all")
+    require(len(table) or not len(table.columns), "rows", "one for each time", "none")
+    rows = table.index.to_numpy() + 1
     columns = {str(name).strip().lower(): name for name in reversed(table.columns)}
     episode, time, concept = (
         next((columns[name] for name in names if name in columns), None) for names in (EPISODE, TIME, CONCEPT)
     )
-    numeric, notes = [], set()
+    numeric, notes, dtypes = [], set(), dict(table.dtypes)
     for name in table.columns:
         plain = str(name).strip().lower()
         if name in (episode, time, concept):
             continue
         if plain in ROLES or plain.startswith(INDEX) or plain in ("", "index"):
             notes.add(f"column {short(str(name))!r} is not read, as an index has this name; rename it if it is of a state")
-        elif table[name].dtype.kind in "fiub":
+        elif dtypes[name].kind in "fiub":
             numeric.append(name)
         else:
             missing = pd.to_numeric(table[name], errors="coerce").isna().to_numpy()
             row = int(missing.argmax())
-            found = f"{short(str(table[name].iloc[row]))!r} in row {table.index[row] + 1}"
+            found = f"{short(str(table[name].iloc[row]))!r} in row {rows[row]}"
             require(missing.all(), f"column {short(str(name))!r}", "numbers", found)
             notes.add(f"column {short(str(name))!r} is not read, as it holds no numbers")
     require(numeric, "columns", "columns of numbers, the columns of a state", short(", ".join(map(str, columns))))
     numbers = table[numeric].to_numpy(dtype=np.float64)
     for row, column in np.argwhere(~np.isfinite(numbers))[:1]:
         place = f"column {short(str(numeric[column]))!r}"
-        raise UserError(f"{place}: expected finite numbers, found {numbers[row, column]} in row {table.index[row] + 1}")
-    codes, times = np.zeros(len(table), dtype=np.int64), np.arange(len(table))
+        raise UserError(f"{place}: expected finite numbers, found {numbers[row, column]} in row {rows[row]}")
+    codes: NDArray[Any] = np.zeros(len(table), dtype=np.int64)
+    times: NDArray[Any] = np.arange(len(table))
     if episode is None:
         note(f"{path}: no column {EPISODE[0]!r}, so all rows are a single demonstration")
     else:
         codes = pd.factorize(table[episode], sort=table[episode].dtype.kind in "iuf")[0]
-        require(codes.min() >= 0, f"column {episode!r}", "a value in each row", f"none in row {table.index[codes.argmin()] + 1}")
+        require(codes.min() >= 0, f"column {episode!r}", "a value in each row", f"none in row {rows[codes.argmin()]}")
     if time is None:
         note(f"{path}: no column {TIME[0]!r}, so the rows of a demonstration are in order")
     else:
@@ -406,7 +403,7 @@ def _of_table(table: "pd.DataFrame", path: Path) -> Arrays:
             stamps.notna().all(),
             f"column {time!r}",
             "a value in each row",
-            f"none in row {table.index[stamps.isna().argmax()] + 1}",
+            f"none in row {rows[stamps.isna().to_numpy().argmax()]}",
         )
         times = stamps.to_numpy()
     order = np.lexsort((times, codes))
@@ -420,7 +417,7 @@ def _of_table(table: "pd.DataFrame", path: Path) -> Arrays:
     if concept is not None:
         kinds, texts = pd.factorize(table[concept])
         other = kinds != kinds[firsts][codes]
-        row = table.index[other.argmax()] + 1
+        row = rows[other.argmax()]
         require(not other.any(), f"column {concept!r}", "a single text for each demonstration", f"another in row {row}")
         arrays["concepts"] = np.array(["" if kind < 0 else str(texts[kind]) for kind in kinds[firsts]], dtype=object)
     _note_unread(str(path), notes)

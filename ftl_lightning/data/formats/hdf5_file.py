@@ -71,8 +71,11 @@ def read_array(item: h5py.Dataset, packed: int) -> NDArray[Any]:
         UserError: naming the array, for texts of MATLAB or longer than :data:`~ftl_lightning.services.files.MOST_HEADER`.
     """
     require("MATLAB_class" not in item.attrs, short(item.name), "an array of another program", "one of MATLAB; save it with -v7")
-    if h5py.check_string_dtype(item.dtype) is None or item.dtype.kind == "S" or not item.shape:
-        return np.asarray(item.asstr()[()] if h5py.check_string_dtype(item.dtype) and item.shape == () else item[()])
+    kind = h5py.check_string_dtype(item.dtype)
+    if kind is None or kind.length is not None:
+        return np.asarray(item[()])
+    if item.shape == ():
+        return np.array(item.asstr()[()])
     most, texts = raised(MOST_HEADER), list[str]()
     batch = max(1, 16 * most // packed)  # a text that is stored once may stand for many
     require(len(item.shape) == 1, short(item.name), "a list of texts", f"texts of shape {item.shape}")

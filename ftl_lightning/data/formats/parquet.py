@@ -120,7 +120,7 @@ def read_lines(path: Path, kinds: Mapping[str, Literal["int64", "string"]]) -> d
 
 
 def read_table(path: Path, roles: Collection[str]) -> tuple[pd.DataFrame, list[str]]:
-    """Read the columns of numbers, and those of texts and dates whose lower-case names are ``roles``; repeated texts are stored once.
+    """Read columns of numbers, and of texts and dates with lower-case names in ``roles``; repeated texts are stored once.
 
     Returns:
         Table, and the names of the columns that are not read.
@@ -131,12 +131,8 @@ def read_table(path: Path, roles: Collection[str]) -> tuple[pd.DataFrame, list[s
     packed = check_readable(path, "Parquet")
     with _opened(path) as file:
         schema, texts, columns = file.schema_arrow, [], []
-        require(
-            len({*schema.names}) == len(schema.names) <= MOST_TENSORS,
-            str(path),
-            f"at most {MOST_TENSORS} names, each once",
-            "others",
-        )
+        once = len({*schema.names}) == len(schema.names) <= MOST_TENSORS
+        require(once, str(path), f"at most {MOST_TENSORS} columns of different names", f"{len(schema.names)} columns")
         for field in schema:
             kind = field.type.value_type if pa.types.is_dictionary(field.type) else field.type
             role = field.name.strip().lower() in roles
