@@ -34,7 +34,7 @@ from ftl_lightning.data.features import precise
 from ftl_lightning.data.formats.files import DAMAGED, TEXTS, check_array, check_arrays, contents_of, write_npz
 from ftl_lightning.data.formats.matlab import check_matlab
 from ftl_lightning.services.errors import UserError, about, note, require, short
-from ftl_lightning.services.files import MOST_HEADER, check_readable, check_unpacked, raised
+from ftl_lightning.services.files import MOST_HEADER, MOST_TENSORS, check_readable, check_unpacked, raised
 from ftl_lightning.services.shipped import check_extra
 from ftl_lightning.services.validation import read_json
 
@@ -80,7 +80,7 @@ def contents_of_arrays(arrays: Mapping[str, NDArray[Any]], place: str) -> Conten
     for key in ("states", *per_step):
         if key in arrays and arrays[key].dtype.kind == "O":
             with about(f"key {short(key)!r}"):
-                whole, lengths = stacked([array_of(part) for part in np.atleast_1d(arrays[key])])
+                whole, lengths = stacked([array_of(part) for part in np.atleast_1d(arrays[key])[: MOST_TENSORS + 1]])
             given = arrays.setdefault("lengths", lengths.numpy())
             require(np.array_equal(given, lengths), "key 'lengths'", f"the lengths of {short(key)!r}", "others")
             arrays[key] = whole.numpy()

@@ -15,7 +15,7 @@ CELLS, STRUCTS, PLAIN = 1, 2, (4, *range(6, 16))
 
 
 def check_matlab(path: Path, size: int, read: Callable[[str], bool]) -> None:
-    """Refuse a file that unpacks to far more than its bytes, or where a variable holds others than texts, numbers and lists of them.
+    """Refuse a file that unpacks to far more than its bytes, or whose variables hold others than texts and numbers.
 
     Args:
         path, size: file and its bytes.
@@ -59,7 +59,7 @@ def _check_array(content: bytes, order: str, classes: tuple[int, ...], read: Cal
     fits = kind in classes and 0 <= items <= len(content)
     if kind in PLAIN:
         fits &= not parts and (classes != PLAIN or len(elements) == 3 + (flags >> 11 & 1))
-    else:
+    elif fits:
         fields = 1 if kind == CELLS else len(elements[3][1]) // struct.unpack_from(f"{order}i", elements[2][1])[0]
         fits &= len(parts) == items * fields == len(elements) - (2 if kind == CELLS else 4)
     if not fits:
