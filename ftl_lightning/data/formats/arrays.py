@@ -144,7 +144,10 @@ def array_of(value: Any) -> NDArray[Any]:
         return objects if len({part.shape for part in parts}) > 1 else np.stack(parts)
     objects = np.array(value, dtype=object)
     kinds = set(map(type, objects.ravel()))
-    return objects.astype(np.float64 if float in kinds else np.int64) if kinds <= {int, float, bool} else objects
+    try:
+        return objects.astype(np.float64 if float in kinds else np.int64) if kinds <= {int, float, bool} else objects
+    except OverflowError:
+        return objects
 
 
 def _by_name(content: Any) -> Arrays:
