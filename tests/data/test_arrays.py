@@ -235,8 +235,8 @@ def test_tables_are_read_with_notes_on_what_is_assumed(text: str, states: Any, n
         ),
         ("demonstration,concept,x\n0,a,1\n0,b,2\n", "column 'concept': expected a single text for each .* found another in row 2"),
         ("time,x\nnoon,1\nlater,2\n", "expected a table"),
-        ("0,0,0.5\n0,1,0.6\n", "line 1: expected names of columns, found the number 0.5; add a line of names"),
-        ("demonstration,x,y\n0,1,2,3\n0,1,2,4\n", "line 2: expected 3 values between commas, found more"),
+        ("0,0,0.5\n0,1,0.6\n", "line 1: expected names of columns, found the number .*; add a line of names"),
+        ("demonstration,x,y\n0,1,2,3\n0,1,2,4\n", "line 2: expected 3 values between commas, .*found more"),
         ("demonstration,note\n0,a\n", "columns: expected columns of numbers"),
         ("demonstration,x\n", "rows: expected one for each time, found none"),
         (",".join(map(str, range(10_000))), "columns: expected at most 2000, found 10000"),
@@ -351,9 +351,10 @@ def expect_refused(name: str) -> str:
         start = time.process_time()
         with pytest.raises(UserError) as caught:
             Demonstrations.load(name)
-        assert time.process_time() - start < 2
-        assert tracemalloc.get_traced_memory()[1] < 500 * 2**20
+        taken, memory = time.process_time() - start, tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
+    assert taken < 5  # twice as long as without the trace of memory
+    assert memory < 500 * 2**20
     text = str(caught.value)
     assert text.startswith(f"{name}: ")
     assert "\n" not in text

@@ -154,6 +154,10 @@ def check_array(name: str, file: IO[bytes], size: int) -> None:
     """
     version = np.lib.format.read_magic(file)
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    start, width = file.tell(), 2 if version == (1, 0) else 4
+    if int.from_bytes(file.read(width), "little") > size:
+        raise ValueError(f"{name} is shorter than its header states")
+    file.seek(start)
     shape, _, dtype = read(file)
     stated = math.prod(shape) * max(1, dtype.itemsize)  # items of no bytes could be any number
     if not dtype.hasobject and (min(shape, default=0) < 0 or stated != size - file.tell()):
