@@ -539,6 +539,8 @@ def work(kind: str, seed: int, first: int, count: int, link: Connection) -> None
         run = Fuzz(Path(name)).kinds[kind]
         for model in MODELS:  # what is imported for them is none of a file's doing
             load_model(model)
+        with contextlib.suppress(Exception):
+            run(random.Random(kind))
         used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY, used + MEMORY))
         for number in range(first, count):

@@ -418,11 +418,12 @@ def _of_table(table: "pd.DataFrame", path: Path) -> Arrays:
     arrays: Arrays = {"states": gathered(numbers[order], lengths), "lengths": lengths}
     arrays["state_names"] = np.array([str(name) for name in numeric], dtype=object)
     if concept is not None:
-        kinds, texts = pd.factorize(table[concept])
+        kinds, different = pd.factorize(table[concept])
+        texts = [*map(str, different), ""]  # the last for -1, a missing one
         other = kinds != kinds[firsts][codes]
         row = rows[other.argmax()]
         require(not other.any(), f"column {concept!r}", "a single text for each demonstration", f"another in row {row}")
-        arrays["concepts"] = np.array(["" if kind < 0 else str(texts[kind]) for kind in kinds[firsts]], dtype=object)
+        arrays["concepts"] = np.array([texts[kind] for kind in kinds[firsts]], dtype=object)
     _note_unread(str(path), notes)
     return arrays
 
