@@ -8,7 +8,7 @@ from tests.conftest import ROOT, python
 
 
 @pytest.mark.fuzz
-@pytest.mark.parametrize("kind", ["lerobot", "lerobot v2.1", "minari", "bvh"])
+@pytest.mark.parametrize("kind", ["lerobot", "lerobot v2.1", "minari", "bvh", "npy", "json", "mat", "h5", "pt", "csv", "parquet"])
 def test_changed_files_are_read_or_refused(kind: str) -> None:
     for name in ("minari", "h5py", "pyarrow"):
         pytest.importorskip(name)

@@ -26,12 +26,17 @@ import traceback
 import warnings
 import zipfile
 from collections.abc import Callable
+from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
+import pandas as pd
+import pyarrow as pa
 import safetensors.torch
+import scipy.io
 import torch
 import yaml
 
@@ -57,6 +62,7 @@ from ftl_lightning.training.model_folder import load_model
 
 SLOW, MEMORY = 5.0, 2**30
 HEADER = "ftl_lightning"
+FOREIGN = ("npy", "json", "mat", "h5", "pt", "csv", "parquet")
 MODELS = ("driving", "agent", "object_rearrangement", "baseline/cvae/driving", "baseline/in_context/driving", "baseline/bc/driving")
 ODD: tuple[Any, ...] = (
     *(None, True, False, 0, 1, -1, 3, 10_000_000, 10**9, 10**30, 2**63, 0.5, -0.0, 1e308, 1e-320, float("nan"), float("inf")),
@@ -228,6 +234,42 @@ def odd_npz(arrays: dict[str, Any], draw: random.Random) -> bytes:
     return content
 
 
+def odd_foreign(kind: str, arrays: dict[str, Any], draw: random.Random) -> bytes:
+    """Arrays or a table of another program, with other values or bytes changed."""
+    file, odd = io.BytesIO(), draw.random() < 0.6
+    tree = {name: value.tolist() for name, value in arrays.items()}
+    if kind == "json":
+        return as_json(tree, draw)
+    if kind in ("csv", "parquet"):
+        times = [(demo, time) for demo in range(3) for time in range(6)]
+        rows = [[str(demo), str(time), "abc"[demo], str(demo + 0.5), str(time)] for demo, time in times]
+        names = ["demonstration", "time", "concept", "x", "y"]
+        if kind == "csv":
+            return odd_csv([names, *rows], draw)
+        table = pd.read_csv(io.StringIO("\n".join(map(",".join, [names, *rows]))))
+        if odd:
+            cell: Any = draw.choice((None, 1, "abc", 0.5, [1, 2], float("nan"), True, b"x", pd.Timestamp(0)))
+            table[draw.choice(names)] = [cell] * len(table)
+        return table.to_parquet() if odd else _flipped_footer(table.to_parquet(), draw)
+    if kind == "npy":
+        np.save(file, arrays["states"])
+    elif kind == "pt":
+        tensors = {name: torch.from_numpy(value) if value.dtype.kind != "U" else value.tolist() for name, value in arrays.items()}
+        torch.save(tensors | ({draw.choice(list(tree)): mutated(tree, draw)} if odd else {}), file)
+    elif kind == "mat":
+        texts = {
+            name: np.array(value.tolist(), dtype=object) if value.dtype.kind == "U" else value for name, value in arrays.items()
+        }
+        name = draw.choice(list(texts))
+        other = draw.choice((1.5, "abc", [1, "a"], {"a": {"b": 1}}, np.array([[[1]], "b", {}], dtype=object), texts[name][:1]))
+        scipy.io.savemat(file, texts | ({name: other} if odd else {}), do_compression=draw.random() < 0.5)
+    else:
+        with h5py.File(file, "w") as group:
+            for name, value in arrays.items():
+                group[name] = value.tolist() if value.dtype.kind == "U" else value
+    return flipped(file.getvalue(), draw) if not odd or draw.random() < 0.2 else file.getvalue()
+
+
 def _odd_archive(content: bytes, draw: random.Random) -> bytes:
     """The same with one array's header that names another shape, or its member encrypted, twice or of another kind."""
     file = io.BytesIO()
@@ -322,6 +364,8 @@ class Fuzz:
             "scenes": np.ones((3, 2)),
         }
         np.savez(folder / "good.npz", **self.arrays)  # type: ignore[arg-type]
+        (folder / "good.csv").write_text("demonstration,time,concept,x\n0,0,a,1\n0,1,a,2\n")
+        Demonstrations.load(folder / "good.csv")  # pandas reserves memory for texts at the first
         self.demonstrations = self._bytes(Demonstrations.load(folder / "good.npz").save)
         numbers = ["accuracy", "0.5", "a" * 16, "b" * 16, "1.0"]
         own = ["agent", "paper", "go", "BC", "", "", "method", "1", "1.2", "5", "0", "10", *numbers]
@@ -335,9 +379,10 @@ class Fuzz:
             "lerobot v2.1": self.lerobot_old,
             "minari": self.minari,
             "bvh": self.bvh,
-            "csv": self.csv,
+            "results.csv": self.csv,
             "checkpoint": self.checkpoint,
             "yaml": self.yaml,
+            **{kind: partial(self.foreign, kind) for kind in FOREIGN},
         }
 
     def _bytes(self, save: Callable[[Path], None]) -> bytes:
@@ -443,6 +488,10 @@ class Fuzz:
         finally:
             path.write_bytes(content)
 
+    def foreign(self, kind: str, draw: random.Random) -> None:
+        """Arrays or a table of another program."""
+        self._used(self._written(f"foreign.{kind}", odd_foreign(kind, self.arrays, draw)))
+
     def _used(self, path: str | Path) -> None:
         found = Demonstrations.load(path).named("file")
         rows = torch.arange(len(found))
@@ -487,6 +536,7 @@ def work(kind: str, seed: int, first: int, count: int, link: Connection) -> None
     """Run some cases in a process of its own; each is announced before and told after."""
     warnings.filterwarnings("ignore")
     torch.set_num_threads(1)
+    pa.set_memory_pool(pa.system_memory_pool())  # others reserve more than the limit
     with tempfile.TemporaryDirectory() as name:
         run = Fuzz(Path(name)).kinds[kind]
         for model in MODELS:  # what is imported for them is none of a file's doing
@@ -565,7 +615,7 @@ def counts(kind: str, count: int, seed: int, limit: float) -> collections.Counte
 def main() -> None:
     """Print the counts of one kind of files, or of all."""
     demonstrations = ("safetensors", "npz", "lerobot", "lerobot v2.1", "minari", "bvh")
-    kinds = ("config.json", "concept", *demonstrations, "csv", "checkpoint", "yaml")
+    kinds = ("config.json", "concept", *demonstrations, *FOREIGN, "results.csv", "checkpoint", "yaml")
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kind", choices=("all", *kinds), default="all")
     parser.add_argument("--count", type=int, default=1000)

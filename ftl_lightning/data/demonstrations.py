@@ -7,11 +7,12 @@ from typing import Any, Self, TypedDict
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ftl_lightning.data.features import Feature, InitialStates, Observed, precise, take
 from ftl_lightning.services.errors import UserError, about, require, short
-from ftl_lightning.services.files import read_from, written_to
+from ftl_lightning.services.files import MOST_RATIO, MOST_TENSORS, MOST_UNPACKED, raised, read_from, written_to
 from ftl_lightning.services.tensor_file import bytes_hash, serialise
 from ftl_lightning.services.text import Shown, counted
 
@@ -165,11 +166,7 @@ class Demonstrations(Shown):
             UserError: for arrays of other shapes, or other attributes that do not fit.
         """
         require(not any(map(np.ma.is_masked, states)), "states", "every value", "masked values; fill them or leave their times out")
-        paths = [torch.as_tensor(np.asarray(path)).double() for path in states]
-        shapes = sorted({tuple(path.shape[1:]) for path in paths})
-        fits = len(shapes) == 1 and all(path.dim() == 2 and len(path) for path in paths)
-        require(fits, "states", "arrays (time, state) with the same columns", ", ".join(map(str, shapes)) or "none")
-        whole, lengths = padded(paths)
+        whole, lengths = stacked(states)
         columns, count = whole.shape[2], len(whole)
         unnamed = {"domain": "", "state_names": tuple(map(str, range(columns))), "state_units": ("",) * columns}
         texts = (concepts,) * count if isinstance(concepts, str) else tuple(concepts)
@@ -393,6 +390,45 @@ def padded(behaviours: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
     lengths = torch.tensor([len(behaviour) for behaviour in behaviours])
     longest = int(lengths.max())
     return torch.cat([_padded(behaviour[None], longest) for behaviour in behaviours]), lengths
+
+
+def stacked(states: Sequence[Any]) -> tuple[Tensor, Tensor]:
+    """Pad arrays ``(time, state)`` of different lengths, of NumPy or torch, with their last time.
+
+    Returns:
+        ``(demo, longest time, state)`` float64, and lengths ``(demo,)`` int64.
+
+    Raises:
+        UserError: for arrays of other shapes or types.
+    """
+    require(0 < len(states) <= MOST_TENSORS, "states", f"1 to {MOST_TENSORS} arrays (time, state)", str(len(states)))
+    arrays: list[NDArray[np.float64]] = []
+    for index, path in enumerate(states):
+        try:
+            array = np.asarray(path.detach().cpu().double() if isinstance(path, Tensor) else path)
+            found = "other values" if array.dtype.kind == "O" else str(array.dtype)
+            require(array.dtype.kind in "fiub", f"states[{index}]", "numbers (time, state)", found)
+        except (ValueError, TypeError, RuntimeError) as error:
+            raise UserError(f"states[{index}]: expected numbers (time, state), found others ({short(str(error))})") from error
+        columns = f"{arrays[0].shape[1]} columns" if arrays else "columns"
+        fits = array.ndim == 2 and array.size and (not arrays or array.shape[1] == arrays[0].shape[1])
+        require(fits, f"states[{index}]", f"an array (time, state) with {columns}", f"the shape {array.shape}")
+        arrays.append(array.astype(np.float64))
+    lengths = np.array([len(array) for array in arrays])
+    return torch.from_numpy(gathered(np.concatenate(arrays), lengths)), torch.from_numpy(lengths)
+
+
+def gathered(rows: NDArray[np.float64], lengths: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Demonstrations ``(demo, longest time, state)`` of ``lengths`` ``(demo,)`` from all ``rows`` ``(row, state)``, in order.
+
+    Raises:
+        UserError: if padding is far more than the rows.
+    """
+    size, most = len(lengths) * int(lengths.max()) * rows.shape[1] * 8, raised(max(MOST_UNPACKED, MOST_RATIO * rows.nbytes))
+    expected = f"padding to the longest, {lengths.max()}, within {most} bytes"
+    require(size <= most, "lengths", expected, f"{size} bytes; cut long demonstrations or leave out short ones")
+    times = np.minimum(np.arange(lengths.max()), lengths[:, None] - 1)
+    return rows[(np.cumsum(lengths) - lengths)[:, None] + times]
 
 
 def _padded(values: Tensor, time: int) -> Tensor:

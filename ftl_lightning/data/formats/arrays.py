@@ -6,10 +6,10 @@ The names are those of an ``.npz`` file, see :meth:`~ftl_lightning.data.demonstr
 file                   content
 =====================  ==========================================================================================================
 ``.npy``               states ``(demo, time, state)``
-``.json``              an object of nested lists; states may be lists of different lengths
-``.mat``               MATLAB variables up to version 7; version 7.3 is HDF5
+``.json``              an object of nested lists, ``observed`` may be an object; states may be lists of different lengths
+``.mat``               MATLAB variables up to version 7, ``observed`` as a struct; states may be a cell array
 ``.h5``, ``.hdf5``     data sets, ``observed/NAME`` in a group; needs the extra ``hdf5``
-``.pt``, ``.pth``      tensors by name, or states alone; read without unpickling objects
+``.pt``, ``.pth``      tensors by name, or states alone, or a list of states; read without unpickling objects
 ``.csv``               a table with a row for each time: ``demonstration``, ``concept``, optionally ``time``; all other columns of
                        numbers are the columns of a state
 ``.parquet``           the same; needs the extra ``lerobot``
@@ -18,33 +18,46 @@ file                   content
 
 import difflib
 import math
-from collections.abc import Callable, Mapping
+import zipfile
+from collections.abc import Callable, Collection, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from pickle import UnpicklingError
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ftl_lightning.data.demonstrations import FORMATS, OBSERVED, Contents, Demonstrations, Format, padded
+from ftl_lightning.data.demonstrations import FORMATS, OBSERVED, Contents, Demonstrations, Format, gathered, stacked
 from ftl_lightning.data.features import check_single, precise
-from ftl_lightning.data.formats.files import DAMAGED, TEXTS, check_arrays, contents_of, write_npz
+from ftl_lightning.data.formats.files import DAMAGED, TEXTS, check_array, check_arrays, contents_of, write_npz
+from ftl_lightning.data.formats.matlab import check_matlab
 from ftl_lightning.services.errors import UserError, about, note, require, short
-from ftl_lightning.services.files import check_readable, check_unpacked
+from ftl_lightning.services.files import MOST_HEADER, MOST_TENSORS, check_readable, check_unpacked, raised
 from ftl_lightning.services.shipped import check_extra
 from ftl_lightning.services.validation import read_json
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Arrays = dict[str, NDArray[Any]]
 NUMBERS = ("states", "lengths", "scenes")
 """Keys of arrays of numbers, besides observed features."""
-EPISODE, TIME, CONCEPT = (
-    ("demonstration", "demo", "episode", "episode_index"),
-    ("time", "step", "frame_index", "timestamp"),
-    ("concept", "task"),
-)
+EPISODE, CONCEPT = ("demonstration", "demo", "episode", "episode_index"), ("concept", "task")
+TIME = ("time", "step", "frame_index", "timestamp", "t")
+ROLES = (*EPISODE, *TIME, *CONCEPT)
 """Names of the columns of a table that are no columns of a state."""
+INDEX = ("unnamed:", "__index_level_")
+"""Prefixes of columns that pandas adds for the number of a row."""
+UNREAD = np.zeros(0)
+"""In place of an array whose name is unknown."""
+MOST_NOTES = 5
+"""Maximum number of arrays or columns that are noted by name."""
+MOST_COLUMNS = 2000
+"""Maximum number of columns of a table."""
+CELL = 1000
+"""Bytes of a cell of MATLAB in memory."""
 CHANNELS, LEAST_SIDE = (1, 3, 4), 8
 """Numbers of channels of an image, and minimum side for numbers to be an image."""
 
@@ -53,30 +66,40 @@ def contents_of_arrays(arrays: Mapping[str, NDArray[Any]], place: str) -> Conten
     """Attributes of demonstrations from arrays by name; what is not read or is converted is noted.
 
     Args:
-        arrays: see this module.
+        arrays: see this module. Arrays of objects are texts, or states and features at every time of different lengths.
         place: file, for messages.
 
     Raises:
         UserError: for an array of another type than its key requires.
     """
+    require("states" in arrays, "key 'states'", "(demo, time, state)", f"only {short(', '.join(arrays), 120) or 'nothing'}")
     tensors: dict[str, torch.Tensor] = {}
     header: dict[str, Any] = {}
-    states = np.atleast_1d(arrays.get("states", np.zeros(0)))
+    per_step = [OBSERVED + name for name in _texts("per_step", arrays.get("per_step"))]
+    arrays = {**arrays}
+    for key in ("states", *per_step):
+        if key in arrays and arrays[key].dtype.kind == "O":
+            with about(f"key {short(key)!r}"):
+                whole, lengths = stacked([array_of(part) for part in np.atleast_1d(arrays[key])[: MOST_TENSORS + 1]])
+            given = arrays.setdefault("lengths", lengths.numpy())
+            require(np.array_equal(given, lengths), "key 'lengths'", f"the lengths of {short(key)!r}", "others")
+            arrays[key] = whole.numpy()
+    states = np.atleast_1d(arrays["states"])
     for key, array in arrays.items():
-        found = f"one of {short(str(array.dtype))}"
-        if key.startswith(OBSERVED) or key in NUMBERS:
-            require(array.dtype.kind in "fiub", f"key {short(key)!r}", "an array of numbers", found)
-            per_step = key.removeprefix(OBSERVED) in _texts(arrays.get("per_step"))
-            values = _image(place, key, array, 2 if per_step else 1) if key.startswith(OBSERVED) else array
+        kind = short(str(array.dtype)) if array.dtype.kind != "O" else "other values, or lists of different lengths"
+        if _is_numeric(key):
+            require(array.dtype.kind in "fiub", f"key {short(key)!r}", "an array of numbers", f"one of {kind}")
+            feature = key.startswith(OBSERVED)
+            values = _image(place, key, array, 2 if key in per_step else 1) if feature else array
             tensors[key] = tensor_of(key, values, arrays.get("lengths"))
-        elif key in (*TEXTS, "domain"):
-            texts = _texts(array)
-            require(texts or not array.size, f"key {key!r}", "an array of texts", found)
+        elif _is_known(key):
+            texts = _texts(key, array)
+            require(texts or not array.size, f"key {key!r}", "an array of texts", f"one of {kind}")
             repeated = len(states) if key == "concepts" and not array.ndim else 1
             header[key] = texts[0] if key == "domain" and len(texts) == 1 else texts * repeated
-        else:
-            note(f"{place}: array {short(key)!r} is not read; {_nearest(key)}")
-    return contents_of(tensors, header)
+    contents = contents_of(tensors, header)
+    _note_unread(place, {f"array {short(key)!r} is not read; {_nearest(key)}" for key in arrays if not _is_known(key)})
+    return contents
 
 
 def tensor_of(key: str, array: NDArray[Any], lengths: NDArray[Any] | None = None) -> torch.Tensor:
@@ -92,11 +115,72 @@ def tensor_of(key: str, array: NDArray[Any], lengths: NDArray[Any] | None = None
         return torch.from_numpy(np.array(array, dtype=kind, order="C", ndmin=array.ndim))
 
 
-def _texts(array: NDArray[Any] | None) -> list[Any]:
+def _is_numeric(key: str) -> bool:
+    return key in NUMBERS or (key.startswith(OBSERVED) and key != OBSERVED)
+
+
+def _is_known(key: str) -> bool:
+    return _is_numeric(key) or key in (*TEXTS, "domain")
+
+
+def _note_unread(place: str, notes: Collection[str]) -> None:
+    """Note what is not read: a line for each of the first :data:`MOST_NOTES`, and a line for the number of others."""
+    for text in sorted(notes)[:MOST_NOTES]:
+        note(f"{place}: {text}")
+    if len(notes) > MOST_NOTES:
+        note(f"{place}: {len(notes) - MOST_NOTES} more are not read")
+
+
+def array_of(value: Any) -> NDArray[Any]:
+    """Numbers of nested lists; objects for texts, other values, and lists or tensors of different lengths.
+
+    Texts remain objects: an array of texts takes the length of the longest for each.
+    """
+    if isinstance(value, torch.Tensor):
+        return value.detach().to(torch.float32 if value.dtype == torch.bfloat16 else value.dtype).numpy()
+    if isinstance(value, np.ndarray) and value.dtype.kind != "O":
+        return value
+    if isinstance(value, list | tuple) and any(isinstance(part, torch.Tensor) for part in value):
+        parts = [array_of(part) for part in value]
+        objects = np.empty(len(parts), dtype=object)
+        for index, part in enumerate(parts):
+            objects[index] = part
+        return objects if len({part.shape for part in parts}) > 1 else np.stack(parts)
+    objects = np.array(value, dtype=object)
+    kinds = set(map(type, objects.ravel()))
+    try:
+        return objects.astype(np.float64 if float in kinds else np.int64) if kinds <= {int, float, bool} else objects
+    except OverflowError:
+        return objects
+
+
+def _by_name(content: Any) -> Arrays:
+    """Arrays of nested lists or tensors by name, with those of a mapping ``observed``, or of states alone."""
+    content = {"states": content} if isinstance(content, list | tuple | torch.Tensor) else content
+    require(isinstance(content, dict), "content", "arrays by name", type(content).__name__)
+    content = {str(key): value for key, value in content.items()}
+    if isinstance(content.get("observed"), dict):
+        content |= {f"{OBSERVED}{name}": value for name, value in content.pop("observed").items()}
+    return {key: array_of(value) if _is_known(key) else UNREAD for key, value in content.items()}
+
+
+def _texts(key: str, array: NDArray[Any] | None) -> list[str]:
     """Texts of an array of texts, or of bytes in UTF-8; empty for other arrays."""
-    if array is None or array.dtype.kind not in "US":
+    if array is None or array.dtype.kind not in "USO":
         return []
-    texts: list[Any] = np.atleast_1d(array if array.dtype.kind == "U" else np.char.decode(array, "utf-8")).tolist()
+    most, size = raised(MOST_HEADER), 0
+    require(array.size <= most, f"key {key!r}", f"at most {most} texts", str(array.size))
+    flat = np.atleast_1d(array).ravel().tolist()
+    if not all(isinstance(part, str | bytes) for part in flat):
+        return []
+    for part in flat:
+        size += len(part)
+        require(size <= most, f"key {key!r}", f"at most {most} characters", "more; give each concept a short text")
+    try:
+        texts = [part.decode() if isinstance(part, bytes) else part for part in flat]
+        "".join(texts).encode()
+    except UnicodeError as error:
+        raise UserError(f"key {key!r}: expected texts in UTF-8, found others ({short(ascii(str(error)))})") from error
     return texts
 
 
@@ -147,9 +231,8 @@ def _read(name: str, kind: str, load: Callable[[Path, int], Arrays]) -> Contents
     try:
         with about(path):
             arrays = load(path, size)
-    except (*DAMAGED, ImportError) as error:
-        message = f"a damaged or foreign file, or objects ({short(str(error), 100)})"
-        raise UserError(f"{path}: expected {kind}, found {message}") from error
+    except (*DAMAGED, ArithmeticError, AssertionError, ImportError) as error:
+        raise UserError(f"{path}: expected {kind}, found a damaged or foreign file ({short(str(error), 100)})") from error
     with about(path):
         return contents_of_arrays(arrays, name)
 
@@ -157,125 +240,196 @@ def _read(name: str, kind: str, load: Callable[[Path, int], Arrays]) -> Contents
 def _npz(path: Path, size: int) -> Arrays:
     check_arrays(path, size)
     with np.load(path, allow_pickle=False) as archive:
-        arrays = {key: np.asarray(archive[key]) for key in archive.files}
-    "".join(text for array in arrays.values() if array.dtype.kind == "U" for text in np.ravel(array)).encode()
-    return arrays
+        return {key: np.asarray(archive[key]) if _is_known(key) else UNREAD for key in archive.files}
 
 
 def _npy(path: Path, size: int) -> Arrays:
-    return {"states": np.load(path, allow_pickle=False)}
+    with path.open("rb") as file:
+        check_array(path.name, file, size)
+        file.seek(0)
+        return {"states": np.lib.format.read_array(file, allow_pickle=False)}
 
 
 def _json(path: Path, size: int) -> Arrays:
-    content = read_json(path)
-    content = {"states": content} if isinstance(content, list) else content
-    require(isinstance(content, dict), "content", "an object of arrays by name", type(content).__name__)
-    arrays: Arrays = {}
-    ragged = content.get("states")
-    if isinstance(ragged, list) and len({len(part) for part in ragged if isinstance(part, list)}) > 1:
-        states, lengths = padded([torch.from_numpy(np.asarray(part, dtype=np.float64)) for part in ragged])
-        content = {**content, "states": states.numpy(), "lengths": lengths.numpy()}
-    for key, value in content.items():
-        if isinstance(value, dict) and key == OBSERVED.strip("/"):
-            arrays |= {OBSERVED + name: np.asarray(part) for name, part in value.items()}
-        else:
-            arrays[key] = np.asarray(value)
-    return arrays
+    return _by_name(read_json(path))
 
 
 def _mat(path: Path, size: int) -> Arrays:
     from scipy.io import loadmat, whosmat
+    from scipy.io.matlab import MatReadError, matfile_version
 
-    stated = sum(8 * math.prod(shape) for _, shape, _ in whosmat(path))
-    check_unpacked(stated, size, "arrays")
-    content = {key: value for key, value in loadmat(path).items() if not key.startswith("__")}
-    texts = {key: np.asarray(_of_matlab(value)) if key in (*TEXTS, "domain") else value for key, value in content.items()}
-    return {key: value.reshape(-1) if key == "lengths" else value for key, value in texts.items()}
+    try:
+        version = matfile_version(path)[0]
+    except MatReadError as error:
+        raise ValueError(str(error)) from error
+    require(version < 2, "version", "MATLAB up to version 7", "7.3; save it with save('FILE', ..., '-v7')")
+    if version:
+        check_matlab(path, size, lambda name: _is_known(name) or name == "observed")
+    variables = whosmat(path)
+    sizes = (math.prod(shape) * (CELL if kind in ("cell", "struct") else 8) for _, shape, kind in variables)
+    check_unpacked(sum(sizes), size, "variables")
+    known = [name for name, _, _ in variables if _is_known(name) or name == "observed"]
+    content = loadmat(path, variable_names=known) if known else {}
+    arrays: Arrays = {name: content[name] if _is_known(name) else UNREAD for name, _, _ in variables}
+    for name, array in content.items():
+        require(name.startswith("__") or isinstance(array, np.ndarray), f"key {short(name)!r}", "an array", "a sparse matrix")
+    record = content.get("observed", UNREAD)
+    if record.dtype.names and record.size == 1:
+        del arrays["observed"]
+        arrays |= {f"{OBSERVED}{name}": record[name].item() for name in record.dtype.names}
+    for name, array in arrays.items():
+        if name in (*TEXTS, "domain"):
+            arrays[name] = np.array([_of_matlab(part) for part in np.ravel(array)], dtype=object)
+        elif name == "lengths" or array.dtype.kind == "O":
+            arrays[name] = array.reshape(-1)
+    return arrays
 
 
-def _of_matlab(value: NDArray[Any]) -> list[str]:
-    """Texts of a cell array, or of a matrix of characters."""
-    return [str(np.ravel(part)[0]) if isinstance(part, np.ndarray) else str(part).strip() for part in np.ravel(value)]
+def _of_matlab(value: Any) -> Any:
+    """Text of a cell, or of a row of characters."""
+    value = np.ravel(value)[0] if isinstance(value, np.ndarray) and value.size == 1 else value
+    return "" if isinstance(value, np.ndarray) and not value.size else value.strip() if isinstance(value, str) else value
 
 
 def _hdf5(path: Path, size: int) -> Arrays:
     check_extra("hdf5", f"{path}: an HDF5 file")
     from h5py import Dataset
 
-    from ftl_lightning.data.formats.hdf5_file import opened
+    from ftl_lightning.data.formats.hdf5_file import opened, read_array
 
-    arrays: Arrays = {}
-
-    def add(name: str, item: Any) -> None:
-        if isinstance(item, Dataset):
-            array = np.asarray(item.asstr()[()] if item.dtype.kind == "O" else item[()])
-            arrays[name] = array.astype(np.str_) if array.dtype.kind == "O" else array
-
+    names: list[str] = []
     with opened(path) as file:
-        file.visititems(add)
-    return arrays
+        file.visit(names.append)
+        items = {name: file[name] for name in names}
+        return {
+            name: read_array(item, size) if _is_known(name) else UNREAD for name, item in items.items() if isinstance(item, Dataset)
+        }
 
 
 def _torch(path: Path, size: int) -> Arrays:
+    with zipfile.ZipFile(path) as archive:
+        members = archive.infolist()
+        require(sum(member.file_size for member in members) <= size, "content", "no compression, as torch.save writes", "some")
+        damaged = archive.testzip()  # torch does not verify checksums
+    require(damaged is None, short(str(damaged)), "its checksum", "another; the file is damaged")
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except UnpicklingError as error:
-        raise UserError("expected plain tensors and texts, found other objects, which are never read") from error
-    content = {"states": content} if isinstance(content, torch.Tensor) else content
-    require(isinstance(content, dict), "content", "tensors by name", type(content).__name__)
-    return {str(key): value.numpy() if isinstance(value, torch.Tensor) else np.asarray(value) for key, value in content.items()}
+        raise UserError("expected tensors, numbers and texts, found other objects, which are never read; save tensors") from error
+    check_unpacked(sum(tensor.numel() * tensor.element_size() for tensor in _tensors(content)), size, "tensors")
+    return _by_name(content)
+
+
+def _tensors(content: Any) -> Iterator[torch.Tensor]:
+    """Tensors of mappings and lists."""
+    if isinstance(content, torch.Tensor):
+        yield content
+    elif isinstance(content, dict | list | tuple):
+        for part in content.values() if isinstance(content, dict) else content:
+            yield from _tensors(part)
 
 
 def _csv(path: Path, size: int) -> Arrays:
     import pandas as pd
 
-    return _of_table(pd.read_csv(path), path)
+    with path.open("rb") as file:
+        most = max((line.count(b",") for line in file), default=0)
+    require(most < MOST_COLUMNS, "columns", f"at most {MOST_COLUMNS}", str(most + 1))
+    table = pd.read_csv(path.absolute(), compression=None, low_memory=False)
+    require(
+        isinstance(table.index, pd.RangeIndex), "line 2", f"{len(table.columns)} values between commas, as many as names", "more"
+    )
+    number = next((name for name in table.columns if not name.isdigit() and _is_number(name)), None)
+    require(number is None, "line 1", "names of columns", f"the number {short(str(number))}; add a line of names")
+    return _of_table(table, path)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return math.isfinite(float(text))
+    except ValueError:
+        return False
 
 
 def _parquet(path: Path, size: int) -> Arrays:
     check_extra("lerobot", f"{path}: a Parquet file")
     from ftl_lightning.data.formats.parquet import read_table
 
-    return _of_table(read_table(path), path)
+    table, others = read_table(path, ROLES)
+    arrays = _of_table(table, path)
+    _note_unread(str(path), {f"column {short(name)!r} is not read, as it holds no numbers" for name in others})
+    return arrays
 
 
-def _of_table(table: Any, path: Path) -> Arrays:
-    """Arrays of a table (pandas) with a row for each time of each demonstration."""
-    columns = {str(name).strip().lower(): name for name in table.columns}
+def _of_table(table: "pd.DataFrame", path: Path) -> Arrays:
+    """Arrays of a table with a row for each time of each demonstration."""
+    import pandas as pd
+
+    require(len(table.columns) <= MOST_COLUMNS, "columns", f"at most {MOST_COLUMNS}", str(len(table.columns)))
+    if len(table.columns) > 1 and (empty := int(table.isna().all(axis=1).sum())):
+        note(f"{path}: {empty} empty rows are left out")
+        table = table.dropna(how="all")
+    require(len(table) or not len(table.columns), "rows", "one for each time", "none")
+    rows = table.index.to_numpy() + 1
+    columns = {str(name).strip().lower(): name for name in reversed(table.columns)}
     episode, time, concept = (
         next((columns[name] for name in names if name in columns), None) for names in (EPISODE, TIME, CONCEPT)
     )
-    for name in [name for name in table.columns if str(name).startswith("Unnamed:")]:
-        note(f"{path}: column {short(str(name))!r} without a name is not read")
-        table = table.drop(columns=name)
-    if episode is not None:
-        whole = not bool(table[episode].isna().any())
-        require(whole, f"column {episode!r}", "the demonstration of every row", "empty cells; fill them down")
-    if time is not None and episode is not None and bool(table.duplicated([episode, time]).any()):
-        note(f"{path}: several rows of a demonstration have the same {time!r}")
+    numeric, notes, dtypes = [], set(), dict(table.dtypes)
+    for name in table.columns:
+        plain = str(name).strip().lower()
+        if name in (episode, time, concept):
+            continue
+        if plain in ROLES or plain.startswith(INDEX) or plain in ("", "index"):
+            notes.add(f"column {short(str(name))!r} is not read, as an index has this name; rename it if it is of a state")
+        elif dtypes[name].kind in "fiub":
+            numeric.append(name)
+        else:
+            missing = pd.to_numeric(table[name], errors="coerce").isna().to_numpy()
+            row = int(missing.argmax())
+            found = f"{short(str(table[name].iloc[row]))!r} in row {rows[row]}"
+            require(missing.all(), f"column {short(str(name))!r}", "numbers", found)
+            notes.add(f"column {short(str(name))!r} is not read, as it holds no numbers")
+    require(numeric, "columns", "columns of numbers, the columns of a state", short(", ".join(map(str, columns))))
+    numbers = table[numeric].to_numpy(dtype=np.float64)
+    for row, column in np.argwhere(~np.isfinite(numbers))[:1]:
+        place = f"column {short(str(numeric[column]))!r}"
+        raise UserError(f"{place}: expected finite numbers, found {numbers[row, column]} in row {rows[row]}")
+    codes: NDArray[Any] = np.zeros(len(table), dtype=np.int64)
+    times: NDArray[Any] = np.arange(len(table))
     if episode is None:
         note(f"{path}: no column {EPISODE[0]!r}, so all rows are a single demonstration")
-    numeric = [name for name in table.columns if name not in (episode, time, concept) and table[name].dtype.kind in "fiub"]
-    require(numeric, "columns", "columns of numbers, the columns of a state", short(", ".join(map(str, columns))))
-    for name in table.columns:
-        if name not in (episode, time, concept, *numeric):
-            note(f"{path}: column {short(str(name))!r} is not read, as it holds no numbers")
-    if time is not None:
-        table = table.sort_values(time, kind="stable")
-    numbered = episode is not None and table[episode].dtype.kind in "iuf"
-    groups = [] if episode is None else [part for _, part in table.groupby(episode, sort=numbered)]
-    parts = groups if numbered else sorted(groups or [table], key=lambda part: part.index.min())
-    texts = ["" if concept is None else _only(part[concept], path) for part in parts]
-    states, lengths = padded([torch.from_numpy(part[numeric].to_numpy(dtype=np.float64, copy=True)) for part in parts])
-    arrays = {"states": states.numpy(), "lengths": lengths.numpy(), "state_names": np.array([str(name) for name in numeric])}
-    return arrays | ({} if concept is None else {"concepts": np.array(texts)})
-
-
-def _only(texts: Any, path: Path) -> str:
-    """The text of a demonstration's rows."""
-    different = [str(text) for text in texts.unique()]
-    require(len(different) == 1, "column of concepts", "a text for each demonstration", short(", ".join(different)))
-    return different[0]
+    else:
+        codes = pd.factorize(table[episode], sort=table[episode].dtype.kind in "iuf")[0]
+        require(codes.min() >= 0, f"column {episode!r}", "a value in each row", f"none in row {rows[codes.argmin()]}")
+    if time is None:
+        note(f"{path}: no column {TIME[0]!r}, so the rows of a demonstration are in order")
+    else:
+        stamps = table[time] if table[time].dtype.kind in "iufM" else pd.to_datetime(table[time], format="ISO8601")
+        require(
+            stamps.notna().all(),
+            f"column {time!r}",
+            "a value in each row",
+            f"none in row {rows[stamps.isna().to_numpy().argmax()]}",
+        )
+        times = stamps.to_numpy()
+    order = np.lexsort((times, codes))
+    twice = (np.diff(codes[order]) == 0) & (times[order][1:] == times[order][:-1])
+    found = f"two rows of {times[order][1:][twice.argmax()]}" if twice.any() else ""
+    require(not found, f"column {time!r}", "another time in each row of a demonstration", f"{found}; is {EPISODE[0]!r} missing?")
+    lengths = np.bincount(codes)
+    firsts = order[np.cumsum(lengths) - lengths]
+    arrays: Arrays = {"states": gathered(numbers[order], lengths), "lengths": lengths}
+    arrays["state_names"] = np.array([str(name) for name in numeric], dtype=object)
+    if concept is not None:
+        kinds, different = pd.factorize(table[concept])
+        texts = [*map(str, different), ""]  # the last for -1, a missing one
+        other = kinds != kinds[firsts][codes]
+        row = rows[other.argmax()]
+        require(not other.any(), f"column {concept!r}", "a single text for each demonstration", f"another in row {row}")
+        arrays["concepts"] = np.array([texts[kind] for kind in kinds[firsts]], dtype=object)
+    _note_unread(str(path), notes)
+    return arrays
 
 
 def _not_written(demonstrations: Demonstrations, name: str) -> None:

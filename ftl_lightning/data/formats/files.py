@@ -8,7 +8,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import torch
@@ -143,12 +143,25 @@ def check_arrays(path: Path, size: int) -> None:
             check_unpacked(sum(member.file_size for member in members), size, "arrays")
         for member in members:
             with archive.open(member) as file:
-                version = np.lib.format.read_magic(file)
-                read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-                shape, _, dtype = read(file)
-                stated = math.prod(shape) * dtype.itemsize
-                if not dtype.hasobject and (min(shape, default=0) < 0 or stated != member.file_size - file.tell()):
-                    raise ValueError(f"{member.filename} is not of the size that its header states")
+                check_array(member.filename, file, member.file_size)
+
+
+def check_array(name: str, file: IO[bytes], size: int) -> None:
+    """Refuse an array of ``.npy`` whose header contradicts its ``size`` in bytes.
+
+    Raises:
+        ValueError: naming the array.
+    """
+    version = np.lib.format.read_magic(file)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    start, width = file.tell(), 2 if version == (1, 0) else 4
+    if int.from_bytes(file.read(width), "little") > size:
+        raise ValueError(f"{name} is shorter than its header states")
+    file.seek(start)
+    shape, _, dtype = read(file)
+    stated = math.prod(shape) * max(1, dtype.itemsize)  # items of no bytes could be any number
+    if not dtype.hasobject and (min(shape, default=0) < 0 or stated != size - file.tell()):
+        raise ValueError(f"{name} is not of the size that its header states")
 
 
 def cached(settings: Mapping[str, Any], total: int, make: Callable[[Tell], Demonstrations]) -> Demonstrations:

@@ -2,12 +2,16 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from math import prod
 from pathlib import Path
+from typing import Any
 
 import h5py
+import numpy as np
+from numpy.typing import NDArray
 
 from ftl_lightning.services.errors import UserError, require, short
-from ftl_lightning.services.files import check_readable, check_unpacked, raised
+from ftl_lightning.services.files import MOST_HEADER, MOST_UNPACKED, check_readable, check_unpacked, raised
 
 MOST_OBJECTS = 2_000_000
 """Maximum number of groups and arrays in a file; scaled by :func:`~ftl_lightning.services.files.raised`."""
@@ -53,8 +57,33 @@ def _checked_size(file: h5py.File) -> int:
             place, settings = _shown(name), item.get_create_plist()
             require(settings.get_layout() != h5py.h5d.VIRTUAL, place, "data of this file", "a virtual data set, of other files")
             require(not settings.get_external_count(), place, "data of this file", "external storage, in other files")
+            if settings.get_layout() == h5py.h5d.CHUNKED:  # read as a whole, however small the array
+                chunk, most = prod(settings.get_chunk()) * item.get_type().get_size(), raised(MOST_UNPACKED)
+                require(chunk <= most, place, f"chunks of at most {most} bytes", str(chunk))
             size += item.get_space().get_simple_extent_npoints() * item.get_type().get_size()
     return size
+
+
+def read_array(item: h5py.Dataset, packed: int) -> NDArray[Any]:
+    """Read numbers, or texts as objects, from a file of ``packed`` bytes.
+
+    Raises:
+        UserError: naming the array, for texts of MATLAB or longer than :data:`~ftl_lightning.services.files.MOST_HEADER`.
+    """
+    require("MATLAB_class" not in item.attrs, short(item.name), "an array of another program", "one of MATLAB; save it with -v7")
+    kind = h5py.check_string_dtype(item.dtype)
+    if kind is None or kind.length is not None:
+        return np.asarray(item[()])
+    if item.shape == ():
+        return np.array(item.asstr()[()])
+    most, texts = raised(MOST_HEADER), list[str]()
+    batch = max(1, 16 * most // packed)  # a text that is stored once may stand for many
+    require(len(item.shape) == 1, short(item.name), "a list of texts", f"texts of shape {item.shape}")
+    for start in range(0, len(item), batch):
+        texts += item.asstr()[start : start + batch].tolist()
+        size = sum(map(len, texts))
+        require(size <= most, short(item.name), f"at most {most} characters", "more")
+    return np.array(texts, dtype=object)
 
 
 def _shown(name: bytes) -> str:

@@ -119,21 +119,33 @@ def read_lines(path: Path, kinds: Mapping[str, Literal["int64", "string"]]) -> d
         raise UserError(f"{path}: expected {expected} in each line, found others ({short(str(error), 100)})") from error
 
 
-def read_table(path: Path) -> pd.DataFrame:
-    """Read the columns of numbers and texts of a file; repeated texts are stored once.
+def read_table(path: Path, roles: Collection[str]) -> tuple[pd.DataFrame, list[str]]:
+    """Read columns of numbers, and of texts and dates with lower-case names in ``roles``; repeated texts are stored once.
+
+    Returns:
+        Table, and the names of the columns that are not read.
 
     Raises:
         UserError: naming the file, if it is missing, damaged, or unpacks to far more than its size.
     """
     packed = check_readable(path, "Parquet")
     with _opened(path) as file:
-        texts = [field.name for field in file.schema_arrow if _is_text(field.type)]
-        numbers = [field.name for field in file.schema_arrow if _is_number(field.type)]
+        schema, texts, columns = file.schema_arrow, [], []
+        once = len({*schema.names}) == len(schema.names) <= MOST_TENSORS
+        require(once, str(path), f"at most {MOST_TENSORS} columns of different names", f"{len(schema.names)} columns")
+        for field in schema:
+            kind = field.type.value_type if pa.types.is_dictionary(field.type) else field.type
+            role = field.name.strip().lower() in roles
+            if role and _is_text(kind):
+                texts.append(field.name)
+            if _is_number(kind) or (role and (_is_text(kind) or pa.types.is_timestamp(kind))):
+                columns.append(field.name)
         stored = sum(file.metadata.row_group(group).total_byte_size for group in range(file.num_row_groups))
         with about(path):
-            check_unpacked(max(stored, 8 * file.metadata.num_rows * (len(texts) + len(numbers))), packed, "columns")
+            check_unpacked(max(stored, 8 * file.metadata.num_rows * len(columns)), packed, "columns")
     with _opened(path, texts) as file:
-        return file.read(columns=[*texts, *numbers]).to_pandas()
+        table = file.read(columns=columns).to_pandas(ignore_metadata=True)
+    return table, [name for name in schema.names if name not in columns]
 
 
 def write_rows(path: Path, rows: list[dict[str, Any]]) -> None:
