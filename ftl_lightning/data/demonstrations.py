@@ -393,7 +393,7 @@ def padded(behaviours: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
 
 
 def stacked(states: Sequence[Any]) -> tuple[Tensor, Tensor]:
-    """Pad arrays ``(time, state)`` of different lengths, of NumPy or torch, with their last time.
+    """Pad ``states``, arrays ``(time, state)`` of different lengths, of NumPy or torch, with their last time.
 
     Returns:
         ``(demo, longest time, state)`` float64, and lengths ``(demo,)`` int64.
