@@ -31,8 +31,10 @@ LINEAR, ANGLE, QUATERNION, ROTATION, BINARY, CATEGORY = KINDS = (
 )
 TURNS = dict.fromkeys(("rad", "radian", "radians"), 2 * math.pi) | dict.fromkeys(("deg", "degree", "degrees", "°"), 360.0)
 """A whole turn by unit."""
-UNIT_NORM = 1e-3
-"""Maximum error of the norm of a quaternion, or of a row of a rotation matrix, and of their products."""
+UNIT_NORM, STILL = 2e-2, 1e-3
+"""Maximum error of the norm of a quaternion or a row of a rotation matrix and of their products, as after rounding to two decimals;
+maximum change of a column that does not move.
+"""
 WRAPPED, TURN = 0.8, (0.9, 1.001)
 """Share of a turn that a step covers where an angle wraps; range of an angle's values, in turns, for it to be proposed."""
 RARE = 10.0
@@ -359,7 +361,7 @@ def _orthonormal(values: Tensor) -> bool:
 
 def _moves(values: Tensor, least: int = 1) -> bool:
     """Whether at least some columns ``(time, n)`` vary."""
-    return int((values.amax(dim=0) - values.amin(dim=0) > UNIT_NORM).sum()) >= least
+    return int((values.amax(dim=0) - values.amin(dim=0) > STILL).sum()) >= least
 
 
 def _is_quaternion(paths: Sequence[Tensor], names: Sequence[str]) -> bool:
@@ -374,8 +376,8 @@ def _is_quaternion(paths: Sequence[Tensor], names: Sequence[str]) -> bool:
         return True
     squares = every.square()
     subsets = [[column] for column in range(4)] + [[0, column] for column in range(1, 4)]
-    varied = all(float(squares[:, subset].sum(dim=1).std()) > UNIT_NORM for subset in subsets)
-    return varied and bool((every < -UNIT_NORM).any()) and bool((every > UNIT_NORM).any())
+    varied = all(float(squares[:, subset].sum(dim=1).std()) > STILL for subset in subsets)
+    return varied and _moves(every, 4) and bool((every < -STILL).any()) and bool((every > STILL).any())
 
 
 def _one_hot(every: Tensor, first: int, most: int, declared: bool = False) -> int:
