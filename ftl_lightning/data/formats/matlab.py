@@ -59,7 +59,7 @@ def _check_array(content: bytes, order: str, classes: tuple[int, ...], read: Cal
     known = all(type_ in (MATRIX, *DATA) for type_, _ in elements)
     fits = known and kind in classes and 0 <= items <= len(content)
     if kind in PLAIN:
-        fits &= not parts and (classes != PLAIN or len(elements) == 3 + (flags >> 11 & 1))
+        fits &= not parts and len(elements) == 3 + (flags >> 11 & 1)
     elif fits:
         fields = 1 if kind == CELLS else len(elements[3][1]) // struct.unpack_from(f"{order}i", elements[2][1])[0]
         fits &= len(parts) == items * fields == len(elements) - (2 if kind == CELLS else 4)
