@@ -302,6 +302,7 @@ def nested(depth: int) -> bytes:
     return content
 
 
+SHAPE = element(5, struct.pack("<iii", 1, 1, 1))
 MATLAB = b"MATLAB 5.0 MAT-file".ljust(124) + b"\x00\x01IM"
 LARGE = {"x": "x" * 10**6}
 TEXT_BOMB = {"states": STATES.tolist(), "concepts": [*("x" * 10**6,), *["a"] * 3000]}
@@ -330,6 +331,10 @@ BAD: dict[str, tuple[str, Callable[[], bytes]]] = {
     "cells in cells": ("mat", lambda: MATLAB + cells(1, nested(2000), b"states")),
     "a billion cells": ("mat", lambda: MATLAB + cells(1, cells(2**31 - 1, b""), b"states")),
     "a billion numbers": ("mat", lambda: MATLAB + cells(10**9, b"", b"states")),
+    "elements of unknown types": (
+        "mat",
+        lambda: MATLAB + element(14, struct.pack("<IIII", 6, 8, 6, 0) + SHAPE + element(1, b"states") + element(999, bytes(8))),
+    ),
     "MATLAB 7.3": ("mat", lambda: b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + bytes(384)),
     "an object": ("pt", lambda: torch_bytes({"states": torch.zeros(3, 6, 2), "x": Opens()})),
     "a packed archive": ("pt", lambda: torch_bytes({"states": torch.zeros(100, 1000, 100)}, packed=True)),

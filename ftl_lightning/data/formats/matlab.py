@@ -8,8 +8,8 @@ from pathlib import Path
 
 from ftl_lightning.services.files import MOST_HEADER, check_unpacked
 
-MATRIX, COMPRESSED = 14, 15
-"""Types of elements: an array, and a compressed one."""
+MATRIX, COMPRESSED, DATA = 14, 15, (*range(1, 8), 9, 12, 13, 16, 17, 18)
+"""Types of elements: an array, a compressed one, and numbers or characters; scipy crashes at others."""
 CELLS, STRUCTS, PLAIN = 1, 2, (4, *range(6, 16))
 """Classes of arrays: cells and structs, which hold arrays; texts and numbers."""
 
@@ -56,9 +56,10 @@ def _check_array(content: bytes, order: str, classes: tuple[int, ...], read: Cal
         return
     items = math.prod(struct.unpack(f"{order}{len(elements[0][1]) // 4}i", elements[0][1]))
     parts = [data for type_, data in elements if type_ == MATRIX]
-    fits = kind in classes and 0 <= items <= len(content)
+    known = all(type_ in (MATRIX, *DATA) for type_, _ in elements)
+    fits = known and kind in classes and 0 <= items <= len(content)
     if kind in PLAIN:
-        fits &= not parts and (classes != PLAIN or len(elements) == 3 + (flags >> 11 & 1))
+        fits &= not parts and len(elements) == 3 + (flags >> 11 & 1)
     elif fits:
         fields = 1 if kind == CELLS else len(elements[3][1]) // struct.unpack_from(f"{order}i", elements[2][1])[0]
         fits &= len(parts) == items * fields == len(elements) - (2 if kind == CELLS else 4)
