@@ -105,7 +105,7 @@ def contents_of_arrays(arrays: Mapping[str, NDArray[Any]], place: str) -> Conten
 def tensor_of(key: str, array: NDArray[Any], lengths: NDArray[Any] | None = None) -> torch.Tensor:
     """Convert an array: images stay uint8, whole lengths int64, states float64 where float32 loses steps; others float32."""
     if key == "states":
-        each = None if lengths is None else np.ravel(lengths).tolist()
+        each = None if lengths is None or lengths.dtype.kind not in "fiu" else np.ravel(lengths).tolist()
         return torch.from_numpy(np.array(precise(array, each), order="C", ndmin=array.ndim))
     if key.startswith(OBSERVED):
         check_single(key, array)
