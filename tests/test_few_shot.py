@@ -215,7 +215,7 @@ def test_plans_start_where_they_are_told_to(drives: FewShot) -> None:
     with pytest.raises(UserError, match=r"count: expected 3 \(a plan for each of the starts\), or none, found 99"):
         drives.sample(concept, 99, starts, **QUICK)
     for goal in ("go to nowhere", "Go to bowl", ""):
-        with pytest.raises(UserError, match=r"goal: expected a task of driving, such as "):
+        with pytest.raises(UserError, match=r"goal: expected a task of agent, such as "):
             drives.starts(goal)
     assert torch.equal(plans.initial_states.observed[OBSERVED], world)
     for observed in (world, world.numpy(), world.tolist(), {OBSERVED: world.numpy()}, InitialStates({OBSERVED: world})):
