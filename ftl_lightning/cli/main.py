@@ -172,7 +172,7 @@ def _modes() -> AbstractContextManager[None]:
 
 
 def _refused(message: str) -> int:
-    say("error:", short(line(message), LONGEST - len("error: ")), error=True)
+    say("error:", short(line(message), LONGEST + 100), error=True)
     return 2
 
 
