@@ -6,18 +6,17 @@ Name, plans, concepts and source are required; every other field has a default.
 import difflib
 import importlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, Protocol, Self, runtime_checkable
 
 import torch
 from torch import Tensor
 
-from ftl_lightning.data.columns import aligned, check_precision
-from ftl_lightning.data.demonstrations import Demonstrations, padded, paths_of
+from ftl_lightning.data.columns import aligned
+from ftl_lightning.data.demonstrations import Demonstrations, padded
 from ftl_lightning.data.distances import Distance
 from ftl_lightning.data.features import Feature, InitialStates, Observed
-from ftl_lightning.data.kinds import LINEAR, check_values
 from ftl_lightning.domains.comparison import Comparison
 from ftl_lightning.domains.execution import ClosedLoop, Rollout
 from ftl_lightning.domains.pictures import Show, line_drawings
@@ -316,22 +315,12 @@ class Domain(Shown):
         Raises:
             UserError: naming the ``place`` or key, for behaviour of another domain, other columns or units, or a missing feature.
         """
-        known = (self.name, "") if self.name != OWN else (self.name, "", demonstrations.domain)  # a user's data may name any
         wanted = f"behaviour of {self.name}, the model's domain"
-        require(demonstrations.domain in known, place, wanted, f"that of {short(demonstrations.domain)}")
+        require(demonstrations.domain in (self.name, ""), place, wanted, f"that of {short(demonstrations.domain)}")
         expected, columns = len(self.plans.columns), demonstrations.states.shape[2]
         advice = "; exchange axes 1 and 2" if demonstrations.states.shape[1] == expected else ""
         require(columns == expected, place, f"states of {expected} columns ({self.name})", f"{columns}{advice}")
-        fitted = aligned(demonstrations, self.plans.columns, self.plans.units).fitted(self.observed)
-        if self.name != OWN:
-            return fitted
-        kinds = self.plans.kinds or (LINEAR,) * expected
-        words = [[text.partition(" ")[0] for text in texts] for texts in (fitted.state_kinds or kinds, kinds)]
-        wanted = f"{short(', '.join(words[1]), 100)}, the model's"
-        require(words[0] == words[1], "key 'state_kinds'", wanted, short(", ".join(words[0]), 100))
-        check_values(paths_of(fitted), fitted.state_names, kinds)
-        check_precision(fitted)
-        return replace(fitted, state_kinds=kinds)
+        return aligned(demonstrations, self.plans.columns, self.plans.units).fitted(self.observed)
 
     def measure(self, goal: str, states: Tensor, starts: InitialStates | None) -> dict[str, Tensor]:
         """Values of all metrics for plans ``(sample, horizon, state)``, by name.

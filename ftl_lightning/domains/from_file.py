@@ -35,12 +35,12 @@ from ftl_lightning.data.columns import check_precision
 from ftl_lightning.data.demonstrations import Demonstrations, held, paths_of
 from ftl_lightning.data.distances import warped_distances
 from ftl_lightning.data.features import InitialStates
-from ftl_lightning.data.kinds import Columns, declared, resolved
+from ftl_lightning.data.kinds import LINEAR, Columns, check_values, declared, resolved
 from ftl_lightning.domains.comparison import Comparison
 from ftl_lightning.domains.domain import OWN, Concepts, Domain, Metric, Plans, Recordings, Split, View
 from ftl_lightning.domains.recognition import Recognition
 from ftl_lightning.domains.recorder import drawn_by_hand
-from ftl_lightning.services.errors import about, note, require
+from ftl_lightning.services.errors import about, note, require, short
 from ftl_lightning.services.randomness import generator
 from ftl_lightning.services.spectrum import check_cosines
 
@@ -83,6 +83,21 @@ class OwnDomain(Domain):
     """Domain of user data, which is pickled by the arguments of :func:`own_domain`."""
 
     arguments: tuple[Any, ...] = ()
+
+    def fitted(self, demonstrations: Demonstrations, place: str = "states") -> Demonstrations:
+        """As of any domain, and of the kinds of the model's columns. Data of a user may name any domain.
+
+        Raises:
+            UserError: also for other kinds, values that contradict a kind, and columns whose steps float32 cannot hold.
+        """
+        fitted = super().fitted(replace(demonstrations, domain=self.name), place)
+        kinds = self.plans.kinds or (LINEAR,) * len(self.plans.columns)
+        words = [[text.partition(" ")[0] for text in texts] for texts in (fitted.state_kinds or kinds, kinds)]
+        wanted = f"{short(', '.join(words[1]), 100)}, the model's"
+        require(words[0] == words[1], "key 'state_kinds'", wanted, short(", ".join(words[0]), 100))
+        check_values(paths_of(fitted), fitted.state_names, kinds)
+        check_precision(fitted)
+        return replace(fitted, state_kinds=kinds, domain=demonstrations.domain)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return own_domain, self.arguments
