@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ftl_lightning.data.demonstrations import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations, paths_of
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.films import VectorFilm, still
 from ftl_lightning.services.errors import require, shown
@@ -141,7 +141,7 @@ def drawn_by_hand(examples: Demonstrations, horizon: int) -> Recorder | None:
     """Recorder of lines of ``horizon`` states in a window around examples; ``None`` if behaviour is not a line in a plane."""
     if examples.states.shape[2] != 2 or horizon < 2 or examples.observed:
         return None
-    covered = torch.cat([states[:length] for states, length in zip(examples.states, examples.lengths.tolist(), strict=True)])
+    covered = torch.cat(paths_of(examples))
     low, high = covered.amin(dim=0).double().numpy(), covered.amax(dim=0).double().numpy()
     middle, side = (low + high) / 2, max(float((high - low).max()), 1e-6)
     corners = middle + side / 2 * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)])
