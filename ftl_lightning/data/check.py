@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ftl_lightning.data.demonstrations import Demonstrations, paths_of, read_contents
 from ftl_lightning.data.kinds import Columns, resolved
-from ftl_lightning.services.errors import about, short
+from ftl_lightning.services.errors import UserError, about, short
 
 T = TypeVar("T")
 MOST_NAMED = 6  # demonstrations to list individually
@@ -178,9 +178,16 @@ def _roughness(states: Tensor, axis: int) -> float:
 def _continuous(demonstrations: Demonstrations) -> tuple[Demonstrations, list[Finding]]:
     """Demonstrations with continuous columns of their kinds, which are proposed unless known, and findings about proposals."""
     names, kinds, findings = demonstrations.state_names, demonstrations.state_kinds, list[Finding]()
-    if not kinds:
-        kinds = resolved(paths_of(demonstrations), names, demonstrations.state_units, ("",) * len(names), "states")
-        findings = [Finding(text, "note") for text in Columns(kinds).notes(names)]
+    try:
+        known = bool(kinds) and bool(Columns(kinds).groups)
+    except UserError:
+        known = False  # kinds of a file are not resolved
+    if not known:
+        try:
+            kinds = resolved(paths_of(demonstrations), names, demonstrations.state_units, kinds or ("",) * len(names), "states")
+        except UserError as error:
+            findings, kinds = [Finding(str(error).removeprefix("states: "), "error")], ()
+        findings += [Finding(text, "note") for text in Columns(kinds).notes(names)]
     columns, double = Columns(kinds), demonstrations.states.dtype == torch.float64
     if not columns and not double:
         return demonstrations, findings

@@ -9,6 +9,7 @@ import torch
 
 from ftl_lightning.data.demonstrations import Demonstrations, paths_of
 from ftl_lightning.data.features import SMOOTH
+from ftl_lightning.data.kinds import TURNS
 from ftl_lightning.services.errors import UserError, note, require, short
 
 LOST = 1e-2
@@ -19,8 +20,9 @@ LEAST_STEP = 4 * 2.0**-24
 """Minimum median step of a column, as a share of its range, that float32 can hold after scaling."""
 UNITS = {
     **{"m": ("length", 1.0), "cm": ("length", 0.01), "mm": ("length", 0.001), "km": ("length", 1000.0)},
-    **{"ft": ("length", 0.3048), "in": ("length", 0.0254), "rad": ("angle", 1.0), "deg": ("angle", math.pi / 180)},
+    **{"ft": ("length", 0.3048), "in": ("length", 0.0254)},
     **{"s": ("time", 1.0), "ms": ("time", 0.001), "min": ("time", 60.0)},
+    **{unit: ("angle", 2 * math.pi / turn) for unit, turn in TURNS.items()},
 }
 """Quantity and factor of units that are converted."""
 
@@ -107,8 +109,8 @@ def _factor(name: str, unit: str, wanted: str) -> float:
     """Factor from a unit to the wanted unit."""
     if unit == wanted or not unit or not wanted:
         return 1.0
-    (quantity, factor), (other, divisor) = UNITS.get(unit, (unit, 1.0)), UNITS.get(wanted, (wanted, 1.0))
-    known = quantity == other and unit in UNITS and wanted in UNITS
+    (quantity, factor), (other, divisor) = (UNITS.get(text.strip().lower(), ("", 1.0)) for text in (unit, wanted))
+    known = quantity == other and quantity
     found = f"{short(unit, 30)!r}; convert the column"
     require(known, f"key 'state_units': column {short(name, 40)!r}", f"{wanted!r}, the model's unit", found)
     return factor / divisor

@@ -9,28 +9,42 @@ kind            columns    learned as                                           
 ``angle``       1          cosine and sine                                             within a turn
 ``quaternion``  4          two rows of the rotation matrix (6-D, Zhou et al., 2019)     norm 1
 ``rotation``    9, or 6    the first two rows (or columns) of the matrix                orthonormal
+``pose``        16, or 12  position, and the first two rows of the rotation             orthonormal, 0 0 0 1
 ``binary``      1          itself                                                      one of two values
 ``category``    2 or more  themselves, one-hot                                         one-hot
 ==============  =========  ==========================================================  ==================
 
 :func:`resolved` adds what samples need to come back as the data were: ``'angle -180 360 wraps'`` (lowest value, turn, and whether
-paths wrap), ``'quaternion 0 1'`` (component and its sign at the first time), ``'binary 0 1'`` (values), ``'category 3'`` (columns).
+paths wrap), ``'quaternion 0 1'`` (component and its sign at the first time), ``'binary 0 1'`` (values), ``'category 3'`` (columns),
+``'pose 16 0'`` (columns of a homogeneous matrix, and whether it is transposed).
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from ftl_lightning.services.errors import require, short, shown
+from ftl_lightning.services.errors import UserError, require, short, shown
 
-LINEAR, ANGLE, QUATERNION, ROTATION, BINARY, CATEGORY = KINDS = (
-    *("linear", "angle", "quaternion", "rotation", "binary", "category"),
+LINEAR, ANGLE, QUATERNION, ROTATION, POSE, BINARY, CATEGORY = KINDS = (
+    *("linear", "angle", "quaternion", "rotation", "pose", "binary", "category"),
 )
-TURNS = dict.fromkeys(("rad", "radian", "radians"), 2 * math.pi) | dict.fromkeys(("deg", "degree", "degrees", "°"), 360.0)
+RADIANS, DEGREES = 2 * math.pi, 360.0
+"""A whole turn of angles without a unit is one of these."""
+TURNS = {
+    **dict.fromkeys(("rad", "rads", "radian", "radians"), RADIANS),
+    **dict.fromkeys(("deg", "degs", "degree", "degrees", "°", "º"), DEGREES),
+    **dict.fromkeys(("mrad", "mrads", "milliradian", "milliradians"), 1000 * RADIANS),
+    **dict.fromkeys(("turn", "turns", "rev", "revs", "revolution", "revolutions", "rotation", "rotations", "cycle", "cycles"), 1.0),
+    **dict.fromkeys(("grad", "grads", "gradian", "gradians", "gon", "gons"), 400.0),
+    **dict.fromkeys(("arcmin", "arcmins", "arcminute", "arcminutes"), 60 * DEGREES),
+    **dict.fromkeys(("arcsec", "arcsecs", "arcsecond", "arcseconds"), 3600 * DEGREES),
+}
 """A whole turn by unit."""
+SHORT_TURNS = ("rad", "deg", "mrad", "turns", "grad")
+"""Units of angles, for messages."""
 UNIT_NORM, STILL = 2e-2, 1e-3
 """Maximum error of the norm of a quaternion or a row of a rotation matrix and of their products, as after rounding to two decimals;
 maximum change of a column that does not move.
@@ -41,6 +55,9 @@ RARE = 10.0
 """Minimum number of steps for each wrap of an angle, and ratio of a wrap to twice the median step."""
 PAIRS = ((0.0, 1.0), (-1.0, 1.0))
 """Values of columns that are proposed as binary."""
+MOST_INVALID, MOST_UNNAMED = 0.5, 0.25
+"""Maximum share of invalid rotations in columns that are rotations by all others and by their names, or quaternions without names.
+"""
 
 
 @dataclass(frozen=True)
@@ -66,7 +83,7 @@ class Group:
     @property
     def width(self) -> int:
         """Number of continuous columns."""
-        return {ANGLE: 2, QUATERNION: 6, ROTATION: 6}.get(self.kind, self.count)
+        return {ANGLE: 2, QUATERNION: 6, ROTATION: 6, POSE: 9}.get(self.kind, self.count)
 
     @property
     def texts(self) -> tuple[str, ...]:
@@ -81,6 +98,9 @@ class Group:
             return torch.cat((angle.cos(), angle.sin()), dim=-1)
         if self.kind == QUATERNION:
             return _rows(states)
+        if self.kind == POSE:
+            matrices = _homogeneous(states, self.numbers)
+            return torch.cat((matrices[..., 3], matrices[..., :2, :3].flatten(-2)), dim=-1)
         return states[..., : self.width]
 
     def decode(self, encoded: Tensor) -> Tensor:
@@ -92,6 +112,11 @@ class Group:
             return _signed(_quaternion(_matrix(encoded)), int(component), sign)
         if self.kind == ROTATION:
             return _matrix(encoded).flatten(-2)[..., : self.count]
+        if self.kind == POSE:
+            matrices = torch.cat((_matrix(encoded[..., 3:]), encoded[..., :3, None]), dim=-1)
+            last = encoded.new_tensor((0.0, 0, 0, 1)).expand(*encoded.shape[:-1], 1, 4)
+            whole = torch.cat((matrices, last), dim=-2)
+            return (whole.mT if self.numbers[1] else whole).flatten(-2)[..., : self.count]
         if self.kind == BINARY:
             low, high = self.numbers
             return torch.where(encoded > (low + high) / 2, encoded.new_tensor(high), encoded.new_tensor(low))
@@ -147,6 +172,9 @@ class Columns:
                 made += [f"cosine of {part[0]}", f"sine of {part[0]}"]
             elif group.kind == QUATERNION:
                 made += [f"rotation of {part[0]} {number}" for number in range(6)]
+            elif group.kind == POSE:
+                made += [f"position of {part[0]} {number}" for number in range(3)]
+                made += [f"rotation of {part[0]} {number}" for number in range(6)]
             else:
                 made += part[: group.width]
         return tuple(made)
@@ -194,20 +222,23 @@ def resolved(
         place: file or option in messages.
 
     Returns:
-        Resolved kind of each column; empty if all columns are linear.
+        Resolved kind of each column; empty if all columns are linear and none is declared.
 
     Raises:
-        UserError: naming the columns, if values contradict a declared kind.
+        UserError: naming the column, demonstration and time of a value that contradicts a declared kind, or the kind of nearly all
+            other values.
     """
     every = torch.cat(list(paths)).double()
     groups: list[Group] = []
     column = 0
     while column < len(names):
         group = _declared_group(paths, every, names, units, kinds, column, place) if kinds[column].strip() else None
-        group = group or _proposed(paths, every, names, units, kinds, column)
+        group = group or _proposed(paths, every, names, units, kinds, column, place)
         groups.append(group)
         column += group.count
-    return tuple(text for group in groups for text in group.texts) if any(group.kind != LINEAR for group in groups) else ()
+    if all(group.kind == LINEAR for group in groups) and not any(kind.strip() for kind in kinds):
+        return ()
+    return tuple(text for group in groups for text in group.texts)
 
 
 def _groups(kinds: Sequence[str]) -> Iterator[Group]:
@@ -233,31 +264,33 @@ def _resolved(kinds: Sequence[str], first: int) -> Group | None:
         ANGLE: len(numbers) == 3 and numbers[1] > 0,
         QUATERNION: len(numbers) == 2 and numbers[0] in range(4) and abs(numbers[1]) == 1,
         ROTATION: numbers in ((6.0,), (9.0,)),
+        POSE: numbers in ((12.0, 0.0), (16.0, 0.0), (16.0, 1.0)),
         BINARY: len(numbers) == 2 and numbers[0] < numbers[1],
         CATEGORY: len(numbers) == 1 and numbers[0] in range(2, len(kinds) + 1),
     }
     if not fits.get(kind) or not all(map(math.isfinite, numbers)):
         return None
-    count = 4 if kind == QUATERNION else int(numbers[0]) if kind in (CATEGORY, ROTATION) else 1
+    count = 4 if kind == QUATERNION else int(numbers[0]) if kind in (CATEGORY, ROTATION, POSE) else 1
     return Group(kind, first, count, numbers)
 
 
 def check_values(paths: Sequence[Tensor], names: Sequence[str], kinds: Sequence[str]) -> None:
-    """Refuse values that contradict the resolved kinds of a model; ``UserError`` with the column."""
-    every = torch.cat(list(paths)).double()
+    """Refuse values that contradict the resolved kinds of a model; ``UserError`` with the column, demonstration and time."""
     for group in Columns(kinds).groups:
-        values = every[:, group.columns]
-        place = f"column {short(names[group.first], 40)!r}"
-        if group.kind == QUATERNION:
-            require(_unit(values), place, "quaternions of norm 1, as the model's", "others")
-        elif group.kind == ROTATION:
-            require(_orthonormal(values), place, "orthonormal rows, as the model's", "others")
-        elif group.kind == CATEGORY:
-            one_hot = bool(((values == 0) | (values == 1)).all()) and bool((values.sum(dim=1) == 1).all())
-            require(one_hot, place, "one-hot columns, as the model's", "others")
-        elif group.kind == BINARY:
-            known = bool(torch.isin(values, torch.tensor(group.numbers, dtype=torch.double)).all())
-            require(known, place, f"{group.numbers[0]:g} or {group.numbers[1]:g}, as the model's", "other values")
+        if group.kind in _VALID:
+            _require_valid(group, paths, f"column {short(names[group.first], 40)!r}", ", as the model's")
+
+
+def _require_valid(group: Group, paths: Sequence[Tensor], place: str, more: str = "", advice: str = "") -> None:
+    """Refuse a value that is none of the group's kind; ``UserError`` with the first demonstration and time."""
+    for number, path in enumerate(paths, 1):
+        values = path[:, group.columns].double()
+        invalid = ~_VALID[group.kind](values, group.numbers)
+        if bool(invalid.any()):
+            time = int(invalid.int().argmax())
+            row = f"({short(', '.join(f'{value:.4g}' for value in values[time].tolist()), 60)})"
+            expected = _EXPECTED[group.kind].format(*(f"{value:g}" for value in group.numbers)) + more
+            raise UserError(f"{place}: expected {expected}, found {row} in demonstration {number} at time {time}{advice}")
 
 
 def _declared_group(
@@ -268,52 +301,99 @@ def _declared_group(
     run = next((at for at in range(first, len(kinds)) if words[at] != kind), len(kinds)) - first
     what = f"{place}: column {short(names[first], 40)!r}"
     if kind == ANGLE:
-        return _resolved(kinds, first) or Group(
-            kind, first, 1, _turn(paths, first, TURNS.get((kinds[first].split()[1:] or [units[first]])[0], 0.0))
-        )
+        unit = (kinds[first].split()[1:] or [units[first]])[0]
+        known = _resolved(kinds, first)
+        require(known or not unit or turn_of(unit), what, f"a unit of angles ({', '.join(SHORT_TURNS)})", repr(short(unit, 30)))
+        return known or Group(kind, first, 1, _turn(paths, first, turn_of(unit)))
     if kind == QUATERNION:
         require(run % 4 == 0, what, "4 columns of a quaternion", f"{run} in a row")
-        require(_unit(every[:, first : first + 4]), what, "quaternions of norm 1", "others; normalise them")
-        return Group(kind, first, 4, _sign(paths, first))
+        group = Group(kind, first, 4, _sign(paths, first))
+        _require_valid(group, paths, what)
+        return group
     if kind == ROTATION:
         require(run >= 6, what, "9 columns of a rotation matrix, or its first two rows (6)", f"{run} in a row")
-        size = next((size for size in (9, 6) if run >= size and _orthonormal(every[:, first : first + size])), 0)
-        require(size, what, "orthonormal rows with determinant 1", "others")
-        return Group(kind, first, size, (size,))
+        sizes = [Group(kind, first, size, (float(size),)) for size in (9, 6) if run >= size]
+        group = next((group for group in sizes if _share(group, every) > 0.5), sizes[-1])
+        _require_valid(group, paths, what)
+        return group
+    if kind == POSE:
+        require(run >= 12, what, "16 columns of a homogeneous matrix, or its first three rows (12)", f"{run} in a row")
+        group = max(_poses(first, run), key=lambda group: _share(group, every))
+        _require_valid(group, paths, what)
+        return group
     if kind == BINARY:
         values = every[:, first].unique().tolist()
         values = [0.0, 1.0] if values in ([0.0], [1.0]) else values
+        if len(values) == 3:
+            rare = min(values, key=lambda value: int((every[:, first] == value).sum()))
+            _require_valid(Group(kind, first, 1, tuple(value for value in values if value != rare)), paths, what)
         require(len(values) == 2, what, "two values", f"{len(values)}")
         return Group(kind, first, 1, tuple(values))
     if kind == CATEGORY:
         size = _one_hot(every, first, run, declared=True)
+        if not size and _share(whole := Group(kind, first, run, (run,)), every) > 0.5:
+            _require_valid(whole, paths, what)
         require(size, what, "columns of 0 and 1 of which one is 1 at each time (one-hot)", "others")
         return Group(kind, first, size, (size,))
     return Group(LINEAR, first, 1)
 
 
 def _proposed(
-    paths: Sequence[Tensor], every: Tensor, names: Sequence[str], units: Sequence[str], kinds: Sequence[str], first: int
+    paths: Sequence[Tensor], every: Tensor, names: Sequence[str], units: Sequence[str], kinds: Sequence[str], first: int, place: str
 ) -> Group:
     """Group from ``first`` on that the data show, among columns without a declared kind; linear if they show none."""
     free = next((at for at in range(first, len(kinds)) if kinds[at].strip()), len(kinds)) - first
     rest = every[:, first : first + free]
     if free >= 2 and (size := _one_hot(every, first, free)):
         return Group(CATEGORY, first, size, (size,))
-    if free >= 9 and _orthonormal(rest[:, :9]) and _moves(rest[:, :9]):
-        return Group(ROTATION, first, 9, (9,))
-    if free >= 4 and _is_quaternion([path[:, first : first + 4] for path in paths], names[first : first + 4]):
-        return Group(QUATERNION, first, 4, _sign(paths, first))
+    rotations = [*_poses(first, free), Group(ROTATION, first, 9, (9,)), Group(QUATERNION, first, 4, _sign(paths, first))]
+    for group in (group for group in rotations if group.count <= free):
+        if _shows(group, paths, names):
+            place = f"{place}: column {short(names[first], 40)!r}"
+            _require_valid(group, paths, place, advice="; mend it, or declare the columns linear (data.kinds, state_kinds)")
+            return group
     if free and tuple(rest[:, 0].unique()[:3].tolist()) in PAIRS:
         return Group(BINARY, first, 1, tuple(rest[:, 0].unique().tolist()))
-    for turn in dict.fromkeys(TURNS.values()):
-        if (
-            TURNS.get(units[first], turn) == turn
-            and (not units[first] or units[first] in TURNS)
-            and wraps([path[:, first] for path in paths], turn)
-        ):
+    for turn in (turn_of(units[first]),) if units[first] else (RADIANS, DEGREES):
+        if turn and wraps([path[:, first] for path in paths], turn):
             return Group(ANGLE, first, 1, _turn(paths, first, turn))
     return Group(LINEAR, first, 1)
+
+
+def turn_of(unit: str) -> float:
+    """A whole turn in a unit of angles; 0 for another unit."""
+    return TURNS.get(unit.strip().lower(), 0.0)
+
+
+def _poses(first: int, free: int) -> Iterator[Group]:
+    """Poses that fit into ``free`` columns: homogeneous matrices of four rows, as they are or transposed, or of three rows."""
+    yield from (Group(POSE, first, 16, (16.0, transposed)) for transposed in (0.0, 1.0) if free >= 16)
+    if free >= 12:
+        yield Group(POSE, first, 12, (12.0, 0.0))
+
+
+def _share(group: Group, every: Tensor) -> float:
+    """Share of valid rows of a group among states ``(time, state)``."""
+    return float(_VALID[group.kind](every[:, group.columns].double(), group.numbers).double().mean())
+
+
+def _homogeneous(values: Tensor, numbers: Sequence[float]) -> Tensor:
+    """First three rows ``(..., 3, 4)`` of homogeneous matrices from columns ``(..., 16 or 12)``."""
+    whole = values.unflatten(-1, (-1, 4))
+    return (whole.mT if numbers[1] else whole)[..., :3, :]
+
+
+def _shows(group: Group, paths: Sequence[Tensor], names: Sequence[str]) -> bool:
+    """Whether columns are rotations, but for a share of invalid ones of at most :data:`MOST_INVALID`."""
+    values = [path[:, group.columns].double() for path in paths]
+    kept = [path[_VALID[group.kind](path, group.numbers)] for path in values]
+    every = torch.cat(kept)
+    most = MOST_UNNAMED if group.kind == QUATERNION and not _named(names[group.columns]) else MOST_INVALID
+    if len(every) < (1 - most) * sum(map(len, values)):
+        return False
+    if group.kind == QUATERNION:
+        return _is_quaternion([path for path in kept if len(path)], names[group.columns])
+    return _moves(_homogeneous(every, group.numbers)[..., :3].flatten(-2) if group.kind == POSE else every)
 
 
 def wraps(columns: Sequence[Tensor], turn: float) -> bool:
@@ -330,7 +410,7 @@ def wraps(columns: Sequence[Tensor], turn: float) -> bool:
 def _turn(paths: Sequence[Tensor], column: int, turn: float) -> tuple[float, float, float]:
     """Lowest value, whole turn (by the range of values unless given), and 1 if paths wrap."""
     values = torch.cat([path[:, column] for path in paths]).double()
-    turn = turn or (360.0 if float(values.abs().max()) > 2 * TURNS["rad"] else TURNS["rad"])
+    turn = turn or (DEGREES if float(values.abs().max()) > 2 * RADIANS else RADIANS)
     columns = [path[:, column].double() for path in paths]
     wraps = any(bool((column.diff().abs() > turn / 2).any()) for column in columns)
     for low in (-turn / 2, 0.0, float(values.min())):
@@ -346,17 +426,48 @@ def _sign(paths: Sequence[Tensor], first: int) -> tuple[float, float]:
     return float(component), 1.0 if float(starts[:, component].sign().sum()) >= 0 else -1.0
 
 
-def _unit(values: Tensor) -> bool:
-    """Whether rows ``(time, n)`` have norm 1."""
-    return bool(((values.square().sum(dim=-1) - 1).abs() <= 2 * UNIT_NORM).all())
+def _unit(values: Tensor) -> Tensor:
+    """Whether each of the rows ``(time, n)`` has norm 1."""
+    return (values.square().sum(dim=-1) - 1).abs() <= 2 * UNIT_NORM
 
 
-def _orthonormal(values: Tensor) -> bool:
-    """Whether rows ``(time, 9 or 6)`` are orthonormal vectors of three numbers, of a matrix with determinant 1."""
+def _orthonormal(values: Tensor) -> Tensor:
+    """Whether each of the rows ``(time, 9 or 6)`` is of orthonormal vectors of three numbers, of a matrix with determinant 1."""
     rows = values.unflatten(-1, (-1, 3))
-    products = rows @ rows.transpose(-1, -2) - torch.eye(rows.shape[-2], dtype=rows.dtype)
-    proper = rows.shape[-2] < 3 or bool((torch.linalg.det(rows) > 0).all())
-    return proper and bool((products.abs() <= 2 * UNIT_NORM).all())
+    products = rows @ rows.mT - torch.eye(rows.shape[-2], dtype=rows.dtype)
+    valid = (products.abs() <= 2 * UNIT_NORM).flatten(-2).all(dim=-1)
+    return valid if rows.shape[-2] < 3 else valid & (torch.linalg.det(rows) > 0)
+
+
+def _pose(values: Tensor, numbers: Sequence[float]) -> Tensor:
+    """Whether each of the rows ``(time, 16 or 12)`` is a homogeneous matrix of a rotation and a position."""
+    valid = _orthonormal(_homogeneous(values, numbers)[..., :3].flatten(-2))
+    if len(values[0]) == 12:
+        return valid
+    last = values[:, 3::4] if numbers[1] else values[:, 12:]
+    return valid & ((last - values.new_tensor((0.0, 0, 0, 1))).abs() <= STILL).all(dim=-1)
+
+
+def _one_of_each(values: Tensor, numbers: Sequence[float]) -> Tensor:
+    """Whether each of the rows ``(time, n)`` is one-hot."""
+    return ((values == 0) | (values == 1)).all(dim=-1) & (values.sum(dim=-1) == 1)
+
+
+_VALID: Mapping[str, Callable[[Tensor, Sequence[float]], Tensor]] = {
+    QUATERNION: lambda values, numbers: _unit(values),
+    ROTATION: lambda values, numbers: _orthonormal(values),
+    POSE: _pose,
+    CATEGORY: _one_of_each,
+    BINARY: lambda values, numbers: torch.isin(values[:, 0], values.new_tensor(numbers)),
+}
+"""Whether each of the rows ``(time, column)`` is of a kind with the numbers of its group, ``(time,)``."""
+_EXPECTED = {
+    QUATERNION: "quaternions of norm 1",
+    ROTATION: "orthonormal rows with determinant 1",
+    POSE: "homogeneous matrices of rotations, with the last row 0 0 0 1",
+    CATEGORY: "one-hot columns",
+    BINARY: "{} or {}",
+}
 
 
 def _moves(values: Tensor, least: int = 1) -> bool:
@@ -364,15 +475,20 @@ def _moves(values: Tensor, least: int = 1) -> bool:
     return int((values.amax(dim=0) - values.amin(dim=0) > STILL).sum()) >= least
 
 
+def _named(names: Sequence[str]) -> bool:
+    """Whether names of four columns are those of a quaternion."""
+    letters = sorted(name.lower().strip("_. ")[-1:] for name in names)
+    return letters == ["w", "x", "y", "z"] and all("q" in name.lower() or "rot" in name.lower() for name in names)
+
+
 def _is_quaternion(paths: Sequence[Tensor], names: Sequence[str]) -> bool:
     """Whether columns ``(time, 4)`` of norm 1 are quaternions: by names, changes of sign, or no part of constant norm."""
     every = torch.cat(list(paths)).double()
-    if not _unit(every) or not _moves(every, 2):
+    if not _moves(every, 2):
         return False
     if any(bool(((path[1:] * path[:-1]).sum(dim=-1) < -0.5).any()) for path in paths):
         return True
-    letters = [name.lower().strip("_. ")[-1:] for name in names]
-    if sorted(letters) == ["w", "x", "y", "z"] and all("q" in name.lower() or "rot" in name.lower() for name in names):
+    if _named(names):
         return True
     squares = every.square()
     subsets = [[column] for column in range(4)] + [[0, column] for column in range(1, 4)]

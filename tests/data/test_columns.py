@@ -109,6 +109,18 @@ def test_columns_are_put_in_order_by_name_and_converted_to_the_models_units() ->
     ]
     degrees = aligned(some(state_units=("deg", "ms")), ("x", "y"), ("rad", "s"))
     assert torch.allclose(degrees.states, given.states * torch.tensor([np.pi / 180, 1e-3]).float(), rtol=1e-6)
+    for unit, turn in {
+        "revolutions": 1,
+        "turns": 1,
+        "grad": 400,
+        "mrad": 2000 * np.pi,
+        "°": 360,
+        "Degrees": 360,
+        "rad": 2 * np.pi,
+    }.items():
+        with pytest.warns(Note, match="converted"):
+            turns = aligned(some(state_units=(unit, "cm")), ("x", "y"), ("arcmin", "cm"))
+        assert torch.allclose(turns.states[..., 0], given.states[..., 0] * (360 * 60 / turn), rtol=1e-6)
 
 
 @pytest.mark.parametrize(
