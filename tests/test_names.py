@@ -80,7 +80,7 @@ def test_fit_tells_names_that_are_alike_and_refuses_them_where_they_have_one_emb
     arguments = tiny.fit(Path("own.yaml"), f"--data.demonstrations={written(['go up', 'Go  up', 'rest'])}")
     assert main(arguments) == 2
     told = capsys.readouterr().err
-    assert "note: 'go up' and 'Go up' are different concepts" in told.replace("  ", " ")
+    assert ": 'go up' and 'Go up' are different concepts" in told.replace("  ", " ")
     assert "error: concepts: 'go up' and 'Go up' have the same embedding" in told
 
 

@@ -149,6 +149,8 @@ class CommandLine(LightningCLI):
     def before_fit(self) -> None:
         """Resolve ``last`` to the path of the last checkpoint; without any, the run starts anew with a note."""
         options = self.config_init[self._verb]
+        if options.get("ckpt_path"):
+            warnings.filterwarnings("ignore", message="Checkpoint directory .* exists and is not empty")  # as is meant
         if options.get("ckpt_path") == "last":
             options["ckpt_path"] = last_checkpoint(self.trainer)
             if options["ckpt_path"] is None and self._verb == "fit":

@@ -126,7 +126,7 @@ class CheckOptions:
 
 def check(options: CheckOptions) -> None:
     """Check every concept of the file in ``options``; print and draw the results."""
-    from ftl_lightning.data.check import read_mended
+    from ftl_lightning.data.check import axes, read_mended
     from ftl_lightning.few_shot.learner import FewShot
 
     demonstrations, broken = read_mended(options.file)
@@ -134,8 +134,8 @@ def check(options: CheckOptions) -> None:
     if model is not None:
         with about(options.file):
             demonstrations = model.demonstrations(demonstrations, name=Path(options.file).stem)
-    for text in alike(demonstrations.concepts):
-        note(text)
+    for text in (*alike(demonstrations.concepts), *map(str, axes(demonstrations))):
+        note(f"{options.file}: {text}")
     checks = []
     for text in dict.fromkeys(demonstrations.concepts):
         rows = [row for row, concept in enumerate(demonstrations.concepts) if concept == text]

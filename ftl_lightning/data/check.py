@@ -37,6 +37,12 @@ MOST_CHECKED, MOST_LINES = 2000, 2  # demonstrations that are checked before pre
 LEAST_AXIS = 5  # more entries of an axis than this make it a possible time
 SMOOTH_AXIS, EXCHANGED = 0.6, 3.0  # maximum roughness of an exchanged time axis, and minimum ratio of the other's to it
 ROUGH_TIME = 0.9  # minimum roughness along what is no time
+SMOOTH_ALONE = 0.45  # maximum roughness of a time axis that is exchanged with an axis of one entry
+LEAST_SHIFTED, RECURS = (
+    4,
+    0.3,
+)  # minimum number of states of a wave, and maximum share of them that does not follow from those before
+ALIKE_CHANNELS, OTHERWISE = 0.75, 0.2  # minimum correlation of the series of a channel, and its difference from that of others
 BEYOND = 1.5  # minimum ratio of an outlier's least distance to the others' largest, for five and more
 
 
@@ -118,11 +124,11 @@ def read_mended(path: str) -> tuple[Demonstrations, tuple[Finding, ...]]:
 def check(demonstrations: Demonstrations) -> tuple[Finding, ...]:
     """Check demonstrations as examples of a single concept, ignoring their texts; notes are last.
 
-    A demonstration with a finding is excluded from later checks.
+    A demonstration with a finding is excluded from later checks. Axes are checked by :func:`axes`, for all concepts together.
     """
     few = Finding("three to five demonstrations are usual; fewer do not show which of them is odd", "note")
     demonstrations, kinds = _continuous(demonstrations)
-    findings = [*([few] if len(demonstrations) < 3 else []), *kinds, *axes(demonstrations), *_constant(demonstrations)]
+    findings = [*([few] if len(demonstrations) < 3 else []), *kinds, *_constant(demonstrations)]
     remaining = list(range(len(demonstrations)))
     for look in (_lengths, _stills, _units, _duplicates, _jumps, _outliers):
         reported = [finding.among(remaining) for finding in look(demonstrations.rows(remaining))]
@@ -152,27 +158,77 @@ def check_each(demonstrations: Demonstrations) -> list[str]:
 
 
 def axes(demonstrations: Demonstrations) -> Iterator[Finding]:
-    """Find a likely exchange of axes: states are much smoother along demonstrations or columns than along time."""
-    shape = tuple(demonstrations.states.shape)
-    if min(shape) < 2:
-        return
-    states = demonstrations.states.double()
+    """Find a likely exchange of axes: states are much smoother along demonstrations or columns than along time, or the columns of a
+    demonstration are as alike as demonstrations of a concept.
+    """
+    shape, states = tuple(demonstrations.states.shape), demonstrations.states.double()
     demo, time, column = (_roughness(states, axis) for axis in range(3))
-    if not ROUGH_TIME < time < torch.inf:
-        return
-    for other, rough, order in ((0, demo, (1, 0, 2)), (2, column, (0, 2, 1))):
-        if shape[other] > LEAST_AXIS and rough < SMOOTH_AXIS and time > EXCHANGED * rough:
-            suggested = f"(demo, time, column) of shape {tuple(shape[axis] for axis in order)}: transpose{order}"
-            yield Finding(f"axes are likely exchanged: states {shape} are smooth along axis {other}, not along time; {suggested}")
-            return
+    smooth = ((0, demo, (1, 0, 2)), (2, column, (0, 2, 1)))
+    numbered = demonstrations.state_names == tuple(map(str, range(shape[2])))
+    found, along = None, 0
+    if shape[1] == 1:
+        likely = [(order, axis) for axis, rough, order in smooth if shape[axis] > LEAST_AXIS and rough < SMOOTH_ALONE]
+        found, along = likely[0] if likely and numbered else (None, 0)
+    elif ROUGH_TIME < time < torch.inf:
+        likely = [(order, axis) for axis, rough, order in smooth if shape[axis] > LEAST_AXIS and rough < SMOOTH_AXIS]
+        rough = dict(enumerate((demo, time, column)))
+        likely = [(order, axis) for order, axis in likely if time > EXCHANGED * rough[axis]]
+        found, along = likely[0] if likely and not _recurs(states[:20, :50]) else (None, 0)
+    elif numbered and len(set(demonstrations.concepts)) == 1 and column > ROUGH_TIME and _channels_first(states):
+        found = (2, 1, 0)
+    if found is not None:
+        reason = f"smooth along axis {along}, not along time" if found != (2, 1, 0) else "alike along axis 2, as demonstrations are"
+        suggested = f"(demo, time, column) of shape {tuple(shape[axis] for axis in found)}: transpose{found}"
+        yield Finding(f"axes are likely exchanged: states {shape} are {reason}; {suggested}")
 
 
 def _roughness(states: Tensor, axis: int) -> float:
     """Median over rows of the root mean square step along an axis, relative to the standard deviation along it."""
+    if states.shape[axis] < 2:
+        return torch.inf
     steps = states.diff(dim=axis).square().mean(dim=axis).sqrt()
     spread = states.std(dim=axis, correction=0)
     varies = spread > SAME * states.abs().amax(dim=axis)
     return float((steps[varies] / spread[varies]).median()) if bool(varies.any()) else torch.inf
+
+
+def _recurs(states: Tensor) -> bool:
+    """Whether each state ``(demo, time, column)`` follows from those before, as in a wave: moved along the columns, or by a linear
+    recurrence.
+    """
+    centred = states - states.mean(dim=1, keepdim=True)
+    time, width = states.shape[1:]
+    spread = centred.square().mean(dim=(1, 2)).clamp(min=SAME)
+    later, earlier, errors = states[:, 1:], states[:, :-1], [torch.full_like(spread, torch.inf)]
+    for shift in range(1, width // 2 + 1) if time >= LEAST_SHIFTED else ():
+        for first, second in ((later[..., shift:], earlier[..., :-shift]), (later[..., :-shift], earlier[..., shift:])):
+            errors.append((first - second).square().mean(dim=(1, 2)) / spread)
+    if (order := min(time // 4, 6)) >= 2:
+        before = torch.stack([centred[:, order - lag : time - lag].flatten(1) for lag in range(1, order + 1)], dim=2)
+        after = centred[:, order:].flatten(1)[..., None]
+        rest = after - before @ (torch.linalg.pinv(before) @ after)
+        errors.append(rest.square().mean(dim=(1, 2)) / spread)
+    return float(torch.stack(errors).amin(dim=0).median()) < RECURS
+
+
+def _channels_first(states: Tensor) -> bool:
+    """Whether series ``(channel, time, demo)`` of a channel are alike and those of different channels are not, without trends."""
+    channels, time, count = states.shape
+    if time < 2 * LEAST_AXIS or count < 3:
+        return False
+    trend = torch.stack((torch.ones(time), torch.arange(time) - (time - 1) / 2)).double()
+    basis = torch.linalg.qr(trend.T).Q
+    series = states.movedim(1, 2)
+    series = series - series @ basis @ basis.T
+    norms = series.norm(dim=2, keepdim=True)
+    series = series / norms.clamp(min=SAME)
+    if bool((norms <= SAME).any()):
+        return False
+    within = (series.sum(dim=1).square().sum(dim=1) - count) / (count * (count - 1))  # mean correlation of pairs, (channel,)
+    pairs = torch.einsum("atd,btd->abd", series.mT, series.mT).abs()
+    between = float((pairs.sum(dim=(0, 1)) - channels).mean()) / max(channels * (channels - 1), 1)
+    alike = float(within.mean())
+    return alike > ALIKE_CHANNELS and between < alike - OTHERWISE
 
 
 def _continuous(demonstrations: Demonstrations) -> tuple[Demonstrations, list[Finding]]:

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from ftl_lightning.data.demonstrations import Demonstrations, paths_of
-from ftl_lightning.data.features import SMOOTH
+from ftl_lightning.data.features import moves
 from ftl_lightning.data.kinds import TURNS
 from ftl_lightning.services.errors import UserError, note, require, short
 
@@ -36,6 +36,8 @@ def check_precision(demonstrations: Demonstrations) -> None:
     paths = [path.double() for path in paths_of(demonstrations)]
     every = torch.cat(paths)
     low, high = every.amin(dim=0), every.amax(dim=0)
+    valid = torch.arange(demonstrations.states.shape[1]) < demonstrations.lengths[:, None]
+    smooth = moves(demonstrations.states.double().numpy(), valid[..., None].numpy())
     for column, name in enumerate(demonstrations.state_names):
         size, width = max(abs(float(low[column])), abs(float(high[column]))), float(high[column] - low[column])
         steps = torch.cat([path[:, column].diff().abs() for path in paths])
@@ -44,23 +46,15 @@ def check_precision(demonstrations: Demonstrations) -> None:
             continue
         if demonstrations.states.dtype == torch.float32:
             spacing = float(np.spacing(np.float32(size)))
-            far = size >= LARGE or (spacing < width / 4 and _smooth([path[:, column] for path in paths]))
+            far = size >= LARGE or (spacing < width / 4 and smooth[column])
             if spacing > LOST * width and far:
                 found = f"steps of {spacing:.2g} near {size:.3g}; subtract an offset, or store float64"
                 raise UserError(f"{place}: expected numbers that float32 can hold, found {found}")
-        elif float(moving.median()) < LEAST_STEP * width and _smooth([path[:, column] for path in paths]):
+        elif float(moving.median()) < LEAST_STEP * width and smooth[column]:
             found = (
                 f"a median step of {float(moving.median()):.2g} in a range of {width:.3g}; leave the column out, or cut the range"
             )
             raise UserError(f"{place}: expected steps that float32 can hold, found {found}")
-
-
-def _smooth(columns: Sequence[torch.Tensor]) -> bool:
-    """Whether a column ``(time,)`` moves smoothly in its demonstrations: neighbouring values are correlated."""
-    centred = [column - column.mean() for column in columns if len(column) > 2]
-    products = sum(float((column[1:] * column[:-1]).sum()) for column in centred)
-    squares = sum(float(column.square().sum()) for column in centred)
-    return squares > 0 and products > SMOOTH * squares
 
 
 def aligned(demonstrations: Demonstrations, names: Sequence[str], units: Sequence[str]) -> Demonstrations:

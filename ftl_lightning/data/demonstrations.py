@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ftl_lightning.data.features import Feature, InitialStates, Observed, precise, take
+from ftl_lightning.data.features import Feature, InitialStates, Observed, check_whole, precise, take
 from ftl_lightning.services.errors import UserError, about, require, short
 from ftl_lightning.services.files import MOST_RATIO, MOST_TENSORS, MOST_UNPACKED, raised, read_from, written_to
 from ftl_lightning.services.tensor_file import bytes_hash, serialise
@@ -64,7 +64,8 @@ def read_contents(path: str | Path) -> Contents:
     kind, name = read_from(str(path))
     contents = _format(kind, name).read(name)
     states, lengths = contents["states"], contents["lengths"]
-    if states.dim() == 3 and lengths.shape == states.shape[:1] and bool(((lengths >= 1) & (lengths <= states.shape[1])).all()):
+    whole = lengths.dtype == torch.int64 and lengths.shape == states.shape[:1]
+    if states.dim() == 3 and whole and bool(((lengths >= 1) & (lengths <= states.shape[1])).all()):
         contents["states"] = held(states, lengths)
         features = {name: held(contents["observed"][name], lengths) for name in contents["per_step"] if _timed(contents, name)}
         contents["observed"] = {**contents["observed"], **features}
@@ -405,9 +406,10 @@ def stacked(states: Sequence[Any]) -> tuple[Tensor, Tensor]:
     arrays: list[NDArray[np.float64]] = []
     for index, path in enumerate(states):
         try:
-            array = np.asarray(path.detach().cpu().double() if isinstance(path, Tensor) else path)
+            array = np.asarray(_plain(path) if isinstance(path, Tensor) else path)
             found = "other values" if array.dtype.kind == "O" else str(array.dtype)
             require(array.dtype.kind in "fiub", f"states[{index}]", "numbers (time, state)", found)
+            check_whole(f"states[{index}]", array)
         except (ValueError, TypeError, RuntimeError) as error:
             raise UserError(f"states[{index}]: expected numbers (time, state), found others ({short(str(error))})") from error
         columns = f"{arrays[0].shape[1]} columns" if arrays else "columns"
@@ -416,6 +418,11 @@ def stacked(states: Sequence[Any]) -> tuple[Tensor, Tensor]:
         arrays.append(array.astype(np.float64))
     lengths = np.array([len(array) for array in arrays])
     return torch.from_numpy(gathered(np.concatenate(arrays), lengths)), torch.from_numpy(lengths)
+
+
+def _plain(tensor: Tensor) -> Tensor:
+    """A tensor on the CPU, of a type that NumPy has."""
+    return tensor.detach().cpu().float() if tensor.dtype == torch.bfloat16 else tensor.detach().cpu()
 
 
 def gathered(rows: NDArray[np.float64], lengths: NDArray[np.int64]) -> NDArray[np.float64]:

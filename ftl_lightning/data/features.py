@@ -21,6 +21,8 @@ READ = "(read)"  # no user's feature has this name
 
 COARSE = 1e-4
 """Maximum spacing of float32 at a column's largest number, as a share of the column's range; more needs float64."""
+LARGEST_WHOLE = 2**53
+"""Largest whole number up to which float64 holds all."""
 SMOOTH = 0.8
 """Minimum correlation of neighbouring values of a column that moves rather than being noise."""
 
@@ -96,17 +98,25 @@ def precise(values: NDArray[Any], lengths: Sequence[int] | None = None) -> NDArr
         size = np.where(valid, np.abs(exact), 0).max(axis=(0, 1), initial=0)
         whole = high.max(axis=0, initial=-np.inf) - low.min(axis=0, initial=np.inf)
         within = (high - low).max(axis=0, initial=0)
-        within = np.where(_moves(exact, valid), within, whole)  # noise within demonstrations is no movement
-        coarse = (np.spacing(size.astype(np.float32)).astype(np.float64) > COARSE * within) & (within > 1e-12 * size)
+        within = np.where(moves(exact, valid), within, whole)  # noise within demonstrations is no movement
+        noise = 0 if values.dtype.kind in "iu" else 1e-12 * size  # of a constant
+        coarse = (np.spacing(size.astype(np.float32)).astype(np.float64) > COARSE * within) & (within > noise)
     return np.asarray(values, dtype=np.float64) if coarse.any() else single
 
 
-def _moves(exact: NDArray[np.float64], valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def moves(exact: NDArray[np.float64], valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Whether columns of ``(demo, time, column)`` move smoothly within demonstrations: neighbouring values are correlated."""
     count = valid.sum(axis=1, keepdims=True)
     centred = np.where(valid, exact - np.where(valid, exact, 0).sum(axis=1, keepdims=True) / np.maximum(count, 1), 0)
     products, squares = (centred[:, 1:] * centred[:, :-1]).sum(axis=(0, 1)), np.square(centred).sum(axis=(0, 1))
     return np.asarray((squares > 0) & (products > SMOOTH * squares))
+
+
+def check_whole(place: str, values: NDArray[Any]) -> None:
+    """Refuse whole numbers that float64 cannot hold; ``UserError`` with the place and the largest number."""
+    if values.dtype.kind in "iu" and values.dtype.itemsize == 8 and values.size:
+        largest = max((int(values.min()), int(values.max())), key=abs)
+        require(abs(largest) <= LARGEST_WHOLE, place, "whole numbers of at most 2^53", f"{largest}; subtract an offset")
 
 
 def check_single(key: str, values: NDArray[Any]) -> None:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ftl_lightning.data.check import Finding, mended
 from ftl_lightning.data.demonstrations import Demonstrations, padded
-from ftl_lightning.data.features import Feature, InitialStates, check_single, precise
+from ftl_lightning.data.features import Feature, InitialStates, check_single, check_whole, precise
 from ftl_lightning.domains.domain import OWN, Domain
 from ftl_lightning.services.errors import UserError, require, short, shown
 
@@ -158,8 +158,9 @@ def tensor_of(key: str, values: Any) -> Tensor:
         raise UserError(f"{key}: expected every value, found a masked one at index {where}; fill it or leave its time out")
     if not isinstance(values, Tensor):
         try:
-            array = np.asarray(values, order="C")
-            tensor = torch.as_tensor(array) if array.dtype.kind in "fiub" else None
+            array = np.asarray(values)
+            kind = np.float64 if array.dtype == np.longdouble else array.dtype.newbyteorder("=")
+            tensor = torch.from_numpy(np.array(array, dtype=kind, order="C")) if array.dtype.kind in "fiub" else None
         except (TypeError, ValueError, RuntimeError):
             tensor = None
     if tensor is None or tensor.is_complex():
@@ -167,6 +168,8 @@ def tensor_of(key: str, values: Any) -> Tensor:
     tensor = tensor.detach().cpu()
     if tensor.dtype in (torch.uint8, torch.float64):
         return tensor
+    if not tensor.is_floating_point() and tensor.dtype != torch.bool:
+        check_whole(key, tensor.numpy())
     return tensor.float() if tensor.is_floating_point() or tensor.dtype == torch.bool else tensor.double()
 
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Self
 import torch
 from numpy.typing import ArrayLike
 
+from ftl_lightning.data.check import axes
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import InitialStates, moved
 from ftl_lightning.domains.domain import Domain, closed_loop_of
@@ -408,6 +409,7 @@ class FewShot(Shown):
         """
         whole, findings = mended_states(states)
         fitted = of_one_concept(self.demonstrations(whole, observed, name))
+        findings = (*findings, *axes(fitted))
         return check_with(self.model, fitted, self.tuned.inversion, self.tuned.learning_steps if learn else 0, findings, progress)
 
     @usual_modes()

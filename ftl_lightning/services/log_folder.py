@@ -32,7 +32,8 @@ _run: contextvars.ContextVar[_Run | None] = contextvars.ContextVar("run", defaul
 def run() -> Iterator[None]:
     """Hold folders that are claimed within the block.
 
-    At its end, empty folders made for the run are removed; all of them, if it was refused before it learned anything.
+    At its end, empty folders made for the run are removed. If the run was refused before it learned anything, all of them are, and
+    new files in the folder of an earlier run.
     """
     current = _Run()
     token = _run.set(current)
@@ -103,16 +104,20 @@ def _claimed(folder: Path, new: bool) -> bool:
             os.close(handle)
             continue
         if current is None:  # outside of a run, nothing marks its end
-            _end(_Run(learns=True), lock, handle, [])
+            _end(_Run(learns=True), lock, handle, [], set())
         else:
-            current.folders.callback(_end, current, lock, handle, missing)
+            current.folders.callback(_end, current, lock, handle, missing, set(folder.rglob("*")))
         return True
 
 
-def _end(ended: _Run, lock: Path, handle: int, made: list[Path]) -> None:
+def _end(ended: _Run, lock: Path, handle: int, made: list[Path], before: set[Path]) -> None:
     """Release a folder, and remove the empty folders that were made for it, innermost first."""
     if lock.parent in made and not ended.learns:
         shutil.rmtree(lock.parent, ignore_errors=True)
+    elif not ended.learns:
+        for path in sorted(set(lock.parent.rglob("*")) - before, reverse=True):  # the content of a folder before the folder
+            with suppress(OSError):
+                path.rmdir() if path.is_dir() and not path.is_symlink() else path.unlink()
     lock.unlink(missing_ok=True)
     os.close(handle)
     for folder in made:

@@ -16,6 +16,7 @@ from ftl_lightning.domains.tasks import WITHOUT_WEIGHT, EvaluationTask
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import NEW_COMPONENT, Concept, Point, file_name
 from ftl_lightning.igm.library import concept_files, write_concept
+from ftl_lightning.igm.settings import InversionSettings
 from ftl_lightning.services import log_folder
 from ftl_lightning.services.errors import UserError, note
 from ftl_lightning.services.modes import usual_modes
@@ -118,7 +119,7 @@ class Adaptation(pl.LightningModule, ABC):
             self.domain = judging_domain(self.model, [self.model.examples, self.demonstrations])
         longer = longer_than_plans(self.demonstrations, self.model)
         for text in notes_of(self.model, self.demonstrations) if self._of_user and data.check else [longer] if longer else []:
-            note(text)
+            note(f"{data.hparams['demonstrations']}: {text}" if self._of_user else text)
 
     def training_step(self, batch: int) -> None:
         """Learn all concepts."""
@@ -230,4 +231,4 @@ class LearnerAdaptation(Adaptation):
         return not model.invertible
 
     def learn(self) -> dict[str, Concept]:
-        return self.model.read_concepts(self.demonstrations)
+        return self.model.learn_concepts(self.demonstrations, InversionSettings(), steps=0)

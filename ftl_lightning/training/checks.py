@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from ftl_lightning.data.check import Finding, check
+from ftl_lightning.data.check import Finding, axes, check
 from ftl_lightning.data.demonstrations import Demonstrations, paths_of
 from ftl_lightning.data.features import moved
 from ftl_lightning.igm.composition import Composition
@@ -132,6 +132,7 @@ def notes_of(model: ConceptModel, demonstrations: Demonstrations) -> Iterator[st
     demonstrations.
     """
     yield from alike(demonstrations.concepts)
+    yield from map(str, axes(demonstrations))
     if longer := longer_than_plans(demonstrations, model):
         yield longer
     names = dict.fromkeys(demonstrations.concepts)

@@ -296,7 +296,7 @@ class OwnData(PretrainingData):
             text = f"demonstrations have up to {longest} steps, so plans are windows of {self.horizon}"
             note(f"data.horizon: {text}; --data.horizon N makes them longer or shorter")
         for text in alike(self.domain.concepts.training):
-            note(text)
+            note(f"{demonstrations}: {text}")
 
     def _domain(self, name: str) -> tuple[str, Domain]:
         return OWN, domain_from_file(self._file, self._horizon, self._metrics, self._share, self._kinds)

@@ -17,10 +17,11 @@ import numpy as np
 import pytest
 import torch
 
+from ftl_lightning import FewShot
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.services.errors import LONGEST, Note, UserError
 from ftl_lightning.services.files import FILES
-from tests.conftest import succeed
+from tests.conftest import ROOT, refused, succeed
 
 STATES = np.random.default_rng(0).normal(size=(3, 6, 2))
 TEXTS = ["up", "left", "dówn"]
@@ -440,3 +441,122 @@ def test_repeated_texts_and_other_columns_of_parquet() -> None:
     assert "columns of different names" in expect_refused("d.parquet")
     write_table(pa.table({"x": ["1.0"]}), "d.parquet")
     assert "expected columns of numbers" in expect_refused("d.parquet")
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        ({"states": [[[1, 2], [3, None]], [[1, 2], [3, 4]]]}, r"key 'states': .* in demonstration 1 at time 1, column 1"),
+        ([[[1, 2], [3, 4]], [[1, 2], [None, 4], [3, 4]]], r"key 'states': .* in demonstration 2 at time 1, column 0"),
+        ([[[1, 2], [3, 4]], [[1, 2], None]], r"key 'states': .* in demonstration 2 at time 1;"),
+        ([[[1, 2], [3, 4]], None], r"key 'states': .* in demonstration 2;"),
+        ({"states": None}, "key 'states': .* in demonstration 1;"),
+        ({"states": [[[1], [2]]] * 2, "lengths": [2, None]}, r"key 'lengths': .* in index \[1\]"),
+        ({"states": [[[1], [2]]] * 2, "observed": {"goal": [[1, 2], [None, 4]]}}, r"key 'observed/goal': .* in index \[1, 0\]"),
+        (
+            {"states": [[[1], [2]]] * 2, "observed": {"goal": [[[1], [2]], [[1], [None]]]}, "per_step": ["goal"]},
+            r"key 'observed/goal': .* in demonstration 2 at time 1, column 0",
+        ),
+    ],
+)
+def test_a_missing_value_in_json_is_refused_with_its_place(content: Any, expected: str, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("d.json").write_text(json.dumps(content))
+    with pytest.raises(UserError, match=f"^d.json: {expected}") as refusal:
+        Demonstrations.load("d.json")
+    refused(capsys, ["check", "d.json"], str(refusal.value)[:60])
+
+
+LARGE = np.arange(24).reshape(2, 6, 2) + 2**53
+
+
+def test_whole_numbers_that_float64_cannot_hold_are_refused() -> None:
+    np.savez("d.npz", states=LARGE)
+    np.savez("observed.npz", states=STATES[:2], **{"observed/time": LARGE[:, 0]})  # type: ignore[arg-type]
+    Path("d.json").write_text(json.dumps(LARGE.tolist()))
+    Path("d.csv").write_text(f"demonstration,time,x\n0,0,{2**53 + 1}\n0,1,{2**53 + 3}\n")
+    torch.save([torch.from_numpy(LARGE[0]), torch.from_numpy(LARGE[1, :3])], "d.pt")
+    for name in ("d.npz", "observed.npz", "d.json", "d.csv", "d.pt"):
+        with pytest.raises(UserError, match=r"expected whole numbers of at most 2\^53, found 90071992547\d+; subtract an offset"):
+            Demonstrations.load(name)
+    for states in (list(LARGE), [torch.from_numpy(path) for path in LARGE], LARGE.astype(np.uint64)):
+        with pytest.raises(UserError, match=r"expected whole numbers of at most 2\^53"):
+            Demonstrations.of(states)
+    with pytest.raises(UserError, match=r"states: expected whole numbers of at most 2\^53"):
+        FewShot.from_pretrained(ROOT / "pretrained" / "strokes").demonstrations(LARGE)
+
+
+def test_whole_numbers_up_to_this_are_exact_and_padding_may_be_any() -> None:
+    exact = LARGE - 30
+    np.savez("d.npz", states=exact)
+    assert Demonstrations.load("d.npz").states.long().tolist() == exact.tolist()
+    padded = exact.copy()
+    padded[:, 4:] = -(2**63)
+    np.savez("d.npz", states=padded, lengths=[4, 4])
+    assert Demonstrations.load("d.npz").states[:, :4].long().tolist() == exact[:, :4].tolist()
+
+
+@pytest.mark.parametrize(
+    "kind", [">f8", ">f4", ">i4", "f2", np.longdouble, "<i2", "u2", "object", "fortran", "read-only", "reversed"]
+)
+def test_arrays_of_any_kind_of_number_and_order_are_read(kind: Any) -> None:
+    whole = np.round(STATES * 100)
+    if kind == "object":
+        given = np.empty(3, dtype=object)
+        given[:] = list(whole)
+    elif kind == "fortran":
+        given = np.asfortranarray(whole)
+    elif kind == "read-only":
+        given = whole.copy()
+        given.flags.writeable = False
+    elif kind == "reversed":
+        given = whole[:, ::-1].copy()[:, ::-1]
+    else:
+        given = whole.astype(kind) if kind != "u2" else np.abs(whole).astype(kind)
+        whole = np.abs(whole) if kind == "u2" else whole
+    model = FewShot.from_pretrained(ROOT / "pretrained" / "strokes")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert np.array_equal(model.demonstrations(given).states, whole)
+        assert np.array_equal(Demonstrations.of(given).states, whole)
+        if kind != "object":
+            np.savez("d.npz", states=given, **{"observed/start": given[:, 0]})  # type: ignore[arg-type]
+            found = Demonstrations.load("d.npz")
+            assert np.array_equal(found.states, whole)
+            assert np.array_equal(found.observed["start"], whole[:, 0])
+
+
+@pytest.mark.parametrize("kind", [complex, np.complex64, "datetime64[s]", "timedelta64[ms]", str, "S", "object"])
+def test_arrays_of_other_than_numbers_are_refused(kind: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    given = (STATES * 100).astype(np.int64).astype(kind)
+    model = FewShot.from_pretrained(ROOT / "pretrained" / "strokes")
+    with pytest.raises(UserError, match="states: expected an array of numbers, found"):
+        model.demonstrations(given)
+    with pytest.raises(UserError, match=r"states\[0\]: expected numbers \(time, state\), found"):
+        Demonstrations.of(given)
+    np.savez("d.npz", states=given)
+    refused(capsys, ["check", "d.npz"], "d.npz: ", "expected an")
+    np.savez("d.npz", states=STATES, **{"observed/start": given[:, 0]})  # type: ignore[arg-type]
+    refused(capsys, ["check", "d.npz"], "d.npz: ", "expected an")
+
+
+def test_lengths_of_whole_numbers_of_any_type_are_read_and_others_refused() -> None:
+    for lengths in (np.array([6.0, 5, 4]), np.array([6, 5, 4], ">i4"), np.array([6, 5, 4], "u1")):
+        np.savez("d.npz", states=STATES, lengths=lengths)
+        assert Demonstrations.load("d.npz").lengths.tolist() == [6, 5, 4]
+    for lengths in (np.array([6.5, 5, 4]), np.array([True] * 3), np.array(["6"] * 3), np.array([6, 5, np.nan])):
+        np.savez("d.npz", states=STATES, lengths=lengths)
+        with pytest.raises(UserError, match="key 'lengths': expected"):
+            Demonstrations.load("d.npz")
+
+
+@pytest.mark.parametrize(
+    "key", ["observed_names", "observed/start_units", "observed_units/start", "observed/start/names", "obs_names"]
+)
+@pytest.mark.parametrize("suffix", ["npz", "json"])
+def test_names_and_units_of_observed_features_are_refused(key: str, suffix: str, capsys: pytest.CaptureFixture[str]) -> None:
+    arrays = {"states": STATES, "observed/start": STATES[:, 0], key: np.array(["x", "y"])}
+    if suffix == "npz":
+        np.savez("d.npz", **arrays)  # type: ignore[arg-type]
+    else:
+        Path("d.json").write_text(json.dumps({name: array.tolist() for name, array in arrays.items()}))
+    refused(capsys, ["check", f"d.{suffix}"], f"d.{suffix}: key '{key}': expected no names and units of observed features, found")

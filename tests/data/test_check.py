@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from ftl_lightning.apps.benchmark.strokes import NEW, TRAINING, strokes
-from ftl_lightning.data.check import check, mended, read_mended
+from ftl_lightning.data.check import axes, check, mended, read_mended
 from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.domains.registry import load_domain
-from tests.conftest import ROOT
+from tests.conftest import ROOT, succeed
 
 
 def demonstrations(states: np.ndarray | torch.Tensor, name: str = "heart") -> Demonstrations:
@@ -141,3 +141,74 @@ def test_a_file_with_missing_numbers_is_read_to_say_so() -> None:
     found, (told,) = read_mended("five.npz")
     assert found.concepts == ("five",) * 5
     assert told.rows == (2,)
+
+
+X, T = np.linspace(0, 2 * np.pi, 50), np.arange(30.0)[:, None]
+PHASE = np.random.default_rng(0).uniform(0, 6, (8, 1, 1))
+WAVES = {
+    "travelling": np.sin(X - T + PHASE),
+    "back": np.sin(X + 2 * T + PHASE),
+    "the same": np.sin(X - T)[None] + np.random.default_rng(1).normal(0, 0.05, (5, 30, 50)),
+    "short": np.sin(X - T[:5] + PHASE),
+    "standing": np.sin(X) * np.cos(1.5 * T + PHASE),
+    "two": np.sin(X - T + PHASE) + 0.5 * np.sin(2 * X - 2.7 * T + PHASE),
+    "pulse": np.exp(-(((np.arange(50) - 5 * T[:9] - PHASE) / 2) ** 2)),
+}
+
+
+@pytest.mark.parametrize("name", WAVES)
+def test_a_wave_over_the_columns_is_no_exchange_of_axes(name: str) -> None:
+    assert not list(axes(Demonstrations.of(list(WAVES[name]), "a")))
+
+
+HEART = strokes("heart", 6, 0)
+WALKS = np.random.default_rng(0).normal(size=(6, 60, 10)).cumsum(axis=1)
+
+
+@pytest.mark.parametrize(
+    ("states", "expected"),
+    [
+        (
+            HEART.transpose(0, 2, 1),
+            "smooth along axis 2, not along time; (demo, time, column) of shape (6, 40, 2): transpose(0, 2, 1)",
+        ),
+        (
+            HEART.transpose(1, 0, 2),
+            "smooth along axis 0, not along time; (demo, time, column) of shape (6, 40, 2): transpose(1, 0, 2)",
+        ),
+        (
+            HEART.transpose(2, 1, 0),
+            "alike along axis 2, as demonstrations are; (demo, time, column) of shape (6, 40, 2): transpose(2, 1, 0)",
+        ),
+        (HEART[..., :1].transpose(0, 2, 1), "(demo, time, column) of shape (6, 40, 1): transpose(0, 2, 1)"),
+        (HEART[..., :1].transpose(1, 0, 2), "(demo, time, column) of shape (6, 40, 1): transpose(1, 0, 2)"),
+        (HEART[..., :1].transpose(2, 1, 0), "(demo, time, column) of shape (6, 40, 1): transpose(2, 1, 0)"),
+        (WALKS.transpose(0, 2, 1), "transpose(0, 2, 1)"),
+        (WALKS.transpose(1, 0, 2), "transpose(1, 0, 2)"),
+    ],
+)
+def test_exchanged_axes_are_noted_once_with_their_order(
+    states: np.ndarray, expected: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    np.savez("five.npz", states=states, concepts=np.array("a"))
+    succeed("check", "five.npz")
+    told = capsys.readouterr()
+    assert told.err.count("note: five.npz: axes are likely exchanged") == 1
+    assert expected in told.err
+    assert "axes" not in told.out
+
+
+def test_exchanged_axes_are_noted_once_for_all_concepts(capsys: pytest.CaptureFixture[str]) -> None:
+    states = np.concatenate([HEART, strokes("spiral", 6, 0), strokes("square", 6, 0)]).transpose(0, 2, 1)
+    np.savez("three.npz", states=states, concepts=np.repeat(["a", "b", "c"], 6))
+    succeed("check", "three.npz")
+    told = capsys.readouterr()
+    assert (told.err.count("axes are likely exchanged"), told.out.count("axes")) == (1, 0)
+
+
+def test_states_of_a_single_time_are_no_exchange_of_axes() -> None:
+    digits = pytest.importorskip("sklearn.datasets").load_digits()
+    for states in (digits.data[:, None], digits.data[np.argsort(digits.target)][:, None], digits.images):
+        assert not list(axes(Demonstrations.of(list(states[:500]), "a")))
+    named = Demonstrations.of(list(HEART[..., :1].transpose(0, 2, 1)), "a", state_names=tuple(f"x{column}" for column in range(40)))
+    assert not list(axes(named))

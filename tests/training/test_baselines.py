@@ -221,6 +221,17 @@ def test_the_wrong_verb_is_told() -> None:
         adaptation.model.read_concepts(replace(drives, observed=drives.initial_states.observed, per_step=()))
 
 
+def test_concepts_of_other_sizes_that_a_method_reads_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    adaptation = LearnerAdaptation(str(DRIVER))
+    drives = load_domain("driving").source(None).split("train", 2, 0).select("merge")
+    adaptation.demonstrations = drives
+    concept = adaptation.learn()["merge"]
+    wide = replace(concept, embeddings=concept.embeddings.repeat(1, 1, 2))
+    monkeypatch.setattr(InContextModel, "read_concepts", lambda self, demonstrations: {"merge": wide})
+    with pytest.raises(UserError, match="key 'embeddings': expected"):
+        adaptation.learn()
+
+
 def test_prompts_can_hide_the_road() -> None:
     model = load_model(DRIVER)
     assert isinstance(model, InContextModel)

@@ -157,7 +157,7 @@ def test_invert_notes_faults_of_a_file_of_ones_own(tiny: Path, five: Demonstrati
     invert = ["invert", "--config", str(CONF / "object_rearrangement.yaml"), f"--model.pretrained={tiny}", "--model.form=paper"]
     invert += ["--data.demonstrations=four.safetensors", "--data.steps=2", "--evaluation.samples=1", "--evaluation.steps=2"]
     succeed(*invert, "--evaluation.figures=0", "--trainer.accelerator=cpu")
-    assert "note: demonstrations 3 and 4: are the same" in capsys.readouterr().err
+    assert "note: four.safetensors: demonstrations 3 and 4: are the same" in capsys.readouterr().err
 
 
 def test_mistakes_are_one_line(capsys: pytest.CaptureFixture[str]) -> None:

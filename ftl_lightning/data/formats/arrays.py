@@ -18,6 +18,7 @@ file                   content
 
 import difflib
 import math
+import re
 import zipfile
 from collections.abc import Callable, Collection, Iterator, Mapping
 from functools import partial
@@ -30,7 +31,7 @@ import torch
 from numpy.typing import NDArray
 
 from ftl_lightning.data.demonstrations import FORMATS, OBSERVED, Contents, Demonstrations, Format, gathered, stacked
-from ftl_lightning.data.features import check_single, precise
+from ftl_lightning.data.features import check_single, check_whole, precise
 from ftl_lightning.data.formats.files import DAMAGED, TEXTS, check_array, check_arrays, contents_of, write_npz
 from ftl_lightning.data.formats.matlab import check_matlab
 from ftl_lightning.services.errors import UserError, about, note, require, short
@@ -58,6 +59,8 @@ MOST_COLUMNS = 2000
 """Maximum number of columns of a table."""
 CELL = 1000
 """Bytes of a cell of MATLAB in memory."""
+_LABELS = re.compile(r"(per_step|observed|observations?|obs)([/_.].*)?[/_.](names|units|kinds)([/_.].*)?", re.IGNORECASE)
+"""Keys of names and units of observed features."""
 CHANNELS, LEAST_SIDE = (1, 3, 4), 8
 """Numbers of channels of an image, and minimum side for numbers to be an image."""
 
@@ -77,10 +80,18 @@ def contents_of_arrays(arrays: Mapping[str, NDArray[Any]], place: str) -> Conten
     header: dict[str, Any] = {}
     per_step = [OBSERVED + name for name in _texts("per_step", arrays.get("per_step"))]
     arrays = {**arrays}
+    for key, array in arrays.items():
+        labels = _LABELS.fullmatch(key) and (not _is_numeric(key) or array.dtype.kind in "USO")
+        found = "names or units, which are not compared; give the columns in the model's order and units, and leave this array out"
+        require(not labels, f"key {short(key)!r}", "no names and units of observed features", found)
     for key in ("states", *per_step):
         if key in arrays and arrays[key].dtype.kind == "O":
             with about(f"key {short(key)!r}"):
-                whole, lengths = stacked([array_of(part) for part in np.atleast_1d(arrays[key])[: MOST_TENSORS + 1]])
+                try:
+                    whole, lengths = stacked([array_of(part) for part in np.atleast_1d(arrays[key])[: MOST_TENSORS + 1]])
+                except UserError:
+                    _check_null(arrays[key], timed=True)
+                    raise
             given = arrays.setdefault("lengths", lengths.numpy())
             require(np.array_equal(given, lengths), "key 'lengths'", f"the lengths of {short(key)!r}", "others")
             arrays[key] = whole.numpy()
@@ -88,6 +99,9 @@ def contents_of_arrays(arrays: Mapping[str, NDArray[Any]], place: str) -> Conten
     for key, array in arrays.items():
         kind = short(str(array.dtype)) if array.dtype.kind != "O" else "other values, or lists of different lengths"
         if _is_numeric(key):
+            if array.dtype.kind == "O":
+                with about(f"key {short(key)!r}"):
+                    _check_null(array, timed=False)
             require(array.dtype.kind in "fiub", f"key {short(key)!r}", "an array of numbers", f"one of {kind}")
             feature = key.startswith(OBSERVED)
             values = _image(place, key, array, 2 if key in per_step else 1) if feature else array
@@ -105,14 +119,36 @@ def contents_of_arrays(arrays: Mapping[str, NDArray[Any]], place: str) -> Conten
 def tensor_of(key: str, array: NDArray[Any], lengths: NDArray[Any] | None = None) -> torch.Tensor:
     """Convert an array: images stay uint8, whole lengths int64, states float64 where float32 loses steps; others float32."""
     if key == "states":
-        each = None if lengths is None or lengths.dtype.kind not in "fiu" else np.ravel(lengths).tolist()
+        known = lengths is not None and lengths.dtype.kind in "fiu" and np.isfinite(lengths).all()
+        each = np.ravel(lengths).tolist() if known else None
+        parts = zip(array, each, strict=False) if each and array.ndim else [(array, None)]
+        for part, length in parts if array.dtype.kind in "iu" else ():  # padding may be any number
+            check_whole("key 'states'", part[: None if length is None else int(length)])
         return torch.from_numpy(np.array(precise(array, each), order="C", ndmin=array.ndim))
     if key.startswith(OBSERVED):
+        check_whole(f"key {short(key)!r}", array)
         check_single(key, array)
     image = array.dtype == np.uint8 and key.startswith(OBSERVED)
-    kind = np.uint8 if image else np.int64 if key == "lengths" and array.dtype.kind in "iu" else np.float32
+    whole = key == "lengths" and (array.dtype.kind in "iu" or (array.dtype.kind == "f" and bool((array == np.round(array)).all())))
+    kind = np.uint8 if image else np.int64 if whole else np.float32
     with np.errstate(over="ignore"):  # overflow is reported later as a number that is not finite
         return torch.from_numpy(np.array(array, dtype=kind, order="C", ndmin=array.ndim))
+
+
+def _check_null(array: NDArray[Any], timed: bool) -> None:
+    """Refuse an array of objects with a missing value, such as ``null`` in JSON; ``UserError`` with its place."""
+    if (index := _null(np.atleast_1d(array))) is not None:
+        words = ("demonstration {}", " at time {}", ", column {}") if timed else ()
+        numbers = (index[0] + 1, *index[1:]) if index else ()
+        place = "".join(map(str.format, words, numbers)) or f"index {list(index)}"
+        raise UserError(f"expected numbers, found none (null) in {place}; fill it or leave its time out")
+
+
+def _null(value: Any) -> tuple[int, ...] | None:
+    """Index of the first missing value in nested lists."""
+    if isinstance(value, list | np.ndarray):
+        return next(((index, *found) for index, part in enumerate(value) if (found := _null(part)) is not None), None)
+    return () if value is None else None
 
 
 def _is_numeric(key: str) -> bool:
@@ -391,6 +427,8 @@ def _of_table(table: "pd.DataFrame", path: Path) -> Arrays:
             require(missing.all(), f"column {short(str(name))!r}", "numbers", found)
             notes.add(f"column {short(str(name))!r} is not read, as it holds no numbers")
     require(numeric, "columns", "columns of numbers, the columns of a state", short(", ".join(map(str, columns))))
+    for name in numeric:
+        check_whole(f"column {short(str(name))!r}", table[name].to_numpy())
     numbers = table[numeric].to_numpy(dtype=np.float64)
     for row, column in np.argwhere(~np.isfinite(numbers))[:1]:
         place = f"column {short(str(numeric[column]))!r}"
