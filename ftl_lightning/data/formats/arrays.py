@@ -119,8 +119,9 @@ def contents_of_arrays(arrays: Mapping[str, NDArray[Any]], place: str) -> Conten
 def tensor_of(key: str, array: NDArray[Any], lengths: NDArray[Any] | None = None) -> torch.Tensor:
     """Convert an array: images stay uint8, whole lengths int64, states float64 where float32 loses steps; others float32."""
     if key == "states":
-        known = lengths is not None and lengths.dtype.kind in "fiu" and np.isfinite(lengths).all()
-        each = np.ravel(lengths).tolist() if known else None
+        each: list[Any] | None = None
+        if lengths is not None and lengths.dtype.kind in "fiu" and bool(np.isfinite(lengths).all()):
+            each = np.ravel(lengths).tolist()
         parts = zip(array, each, strict=False) if each and array.ndim else [(array, None)]
         for part, length in parts if array.dtype.kind in "iu" else ():  # padding may be any number
             check_whole("key 'states'", part[: None if length is None else int(length)])
