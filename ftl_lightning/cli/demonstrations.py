@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from ftl_lightning.training.checks import Check
 
 
-MOST_DEMONSTRATIONS, MOST_WORKERS = 1_000_000, 1000
-"""Maximum number of demonstrations drawn by a command, and of worker processes."""
+MOST_DEMONSTRATIONS, MOST_WORKERS, MOST_CONCEPTS = 1_000_000, 1000, 200
+"""Maximum number of demonstrations drawn by a command, of worker processes, and of concepts of a check."""
 
 
 def generate(
@@ -136,9 +136,12 @@ def check(options: CheckOptions) -> None:
             demonstrations = model.demonstrations(demonstrations, name=Path(options.file).stem)
     for text in alike(demonstrations.concepts):
         note(text)
-    checks = []
-    for text in dict.fromkeys(demonstrations.concepts):
-        rows = [row for row, concept in enumerate(demonstrations.concepts) if concept == text]
+    checks, rows_of = [], dict[str, list[int]]()
+    for row, text in enumerate(demonstrations.concepts):
+        rows_of.setdefault(text, []).append(row)
+    if len(rows_of) > MOST_CONCEPTS:
+        note(f"{options.file}: the first {MOST_CONCEPTS} of {len(rows_of)} concepts are checked")
+    for rows in list(rows_of.values())[:MOST_CONCEPTS]:
         faults = tuple(fault.within(rows) for fault in broken if set(fault.rows) <= set(rows))
         checks.append(_checked(model, demonstrations.rows(rows), faults, options.learn))
         for text_line in str(checks[-1]).splitlines():

@@ -71,6 +71,8 @@ FLOAT32 = 3.4e38
 """Maximum magnitude of a float."""
 DEEPEST = 40
 """Maximum nesting of lists and mappings."""
+MOST_LISTS, MOST_VALUES = 400_000, 4_000_000
+"""Maximum numbers of lists and mappings, and of values, of a JSON text: each takes a hundred times its bytes in memory."""
 _LISTS = (tuple, list, collections.abc.Sequence)
 
 T = TypeVar("T")
@@ -87,9 +89,12 @@ def parse_json(text: str | bytes, kind: str = "JSON") -> Any:
     """Parse a JSON text; ``kind`` is the expected kind, for messages.
 
     Raises:
-        UserError: for damaged text, repeated keys, numbers that are not finite, invalid Unicode, or nesting deeper than
-            :data:`DEEPEST`.
+        UserError: for damaged text, repeated keys, numbers that are not finite, invalid Unicode, nesting deeper than
+            :data:`DEEPEST`, more lists than :data:`MOST_LISTS`, or more values than :data:`MOST_VALUES`.
     """
+    for marks, most, what in (("[{", MOST_LISTS, "lists and mappings"), (",", MOST_VALUES, "values")):
+        count = sum(text.count(mark.encode() if isinstance(text, bytes) else mark) for mark in marks)  # in texts, too few to matter
+        require(count <= most, "content", f"{kind} of at most {most} {what}", str(count))
     try:
         content = json.loads(text.decode() if isinstance(text, bytes) else text, object_pairs_hook=_once)
     except (ValueError, RecursionError) as error:
@@ -118,7 +123,11 @@ def _expect_plain(value: object, left: int) -> None:
     elif isinstance(value, dict | list):
         if not left:
             raise UserError(f"expected lists and mappings at most {DEEPEST} deep, found deeper ones")
-        for item in (*value, *value.values()) if isinstance(value, dict) else value:
+        items = (*value, *value.values()) if isinstance(value, dict) else value
+        kinds = set(map(type, items))
+        if kinds <= {int, bool, type(None)} or (kinds == {float} and all(map(math.isfinite, items))):  # fast for numbers
+            return
+        for item in items:
             _expect_plain(item, left - 1)
 
 
