@@ -126,7 +126,7 @@ class CheckOptions:
 
 def check(options: CheckOptions) -> None:
     """Check every concept of the file in ``options``; print and draw the results."""
-    from ftl_lightning.data.check import read_mended
+    from ftl_lightning.data.check import read_mended, with_kinds
     from ftl_lightning.few_shot.learner import FewShot
 
     demonstrations, broken = read_mended(options.file)
@@ -134,6 +134,10 @@ def check(options: CheckOptions) -> None:
     if model is not None:
         with about(options.file):
             demonstrations = model.demonstrations(demonstrations, name=Path(options.file).stem)
+    else:
+        demonstrations, proposed = with_kinds(demonstrations)
+        for text in proposed:
+            note(f"{options.file}: {text}")
     for text in alike(demonstrations.concepts):
         note(text)
     checks, rows_of = [], dict[str, list[int]]()

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.data.demonstrations import Demonstrations, paths_of, read_contents
-from ftl_lightning.data.kinds import Columns, resolved
+from ftl_lightning.data.kinds import LINEAR, Columns, resolved
 from ftl_lightning.services.errors import about, short
 
 T = TypeVar("T")
@@ -33,6 +33,7 @@ UNITS = 10.0  # ratio of values that suggests other units
 APART = {3: 25.0, 4: 12.0}  # ratio to the usual distance that makes an outlier, by the number of demonstrations
 APART_PLACES, APART_SHAPES = 12.0, 4.0  # ratios for five and more: of states, and of their shapes regardless of place and size
 CLOSEST = {3: 0.5}  # minimum usual distance, as a share of the others' spread, by the number of demonstrations; otherwise 0.1
+MANY, SELDOM = 20, 0.1  # demonstrations from which on columns that a smaller share of them uses make no outlier
 MOST_COMPARED = 50  # demonstrations, evenly taken, whose distances among them are usual for an outlier
 MOST_CHECKED, MOST_LINES = 1000, 2  # demonstrations that are checked before pretraining, and lines of findings
 LEAST_AXIS = 5  # more entries of an axis than this make it a possible time
@@ -155,6 +156,15 @@ def check_each(demonstrations: Demonstrations) -> list[str]:
     return found if more <= 0 else [*found[: MOST_LINES - 1], f"{more + 1} more; list them: python -m ftl_lightning check"]
 
 
+def with_kinds(demonstrations: Demonstrations) -> tuple[Demonstrations, list[str]]:
+    """Demonstrations with proposed kinds unless kinds are known, and notes on proposals. All concepts show what a column is."""
+    names = demonstrations.state_names
+    if demonstrations.state_kinds:
+        return demonstrations, []
+    kinds = resolved(paths_of(demonstrations), names, demonstrations.state_units, ("",) * len(names), "states")
+    return replace(demonstrations, state_kinds=kinds or (LINEAR,) * len(names)), list(Columns(kinds).notes(names))
+
+
 def axes(demonstrations: Demonstrations) -> Iterator[Finding]:
     """Find a likely exchange of axes: states are much smoother along demonstrations or columns than along time."""
     shape = tuple(demonstrations.states.shape)
@@ -181,11 +191,9 @@ def _roughness(states: Tensor, axis: int) -> float:
 
 def _continuous(demonstrations: Demonstrations) -> tuple[Demonstrations, list[Finding]]:
     """Demonstrations with continuous columns of their kinds, which are proposed unless known, and findings about proposals."""
-    names, kinds, findings = demonstrations.state_names, demonstrations.state_kinds, list[Finding]()
-    if not kinds:
-        kinds = resolved(paths_of(demonstrations), names, demonstrations.state_units, ("",) * len(names), "states")
-        findings = [Finding(text, "note") for text in Columns(kinds).notes(names)]
-    columns, double = Columns(kinds), demonstrations.states.dtype == torch.float64
+    demonstrations, notes = with_kinds(demonstrations)
+    names, findings = demonstrations.state_names, [Finding(text, "note") for text in notes]
+    columns, double = Columns(demonstrations.state_kinds), demonstrations.states.dtype == torch.float64
     if not columns and not double:
         return demonstrations, findings
     states = columns.encode(demonstrations.states)
@@ -385,6 +393,9 @@ def _outliers(demonstrations: Demonstrations) -> Iterator[Finding]:
     count, points = len(demonstrations), _points(_paths(demonstrations))
     if count < 3:
         return
+    if count >= MANY:  # the usual spread of a column that few demonstrations use says nothing about them
+        used = (points != points.flatten(0, 1).median(dim=0).values).any(dim=1).double().mean(dim=0) >= SELDOM
+        points = points[:, :, used | ~used.any()]
     views = [(points / _spread(points), APART_PLACES, "is far from the others")]
     if points.shape[1] > 1:
         views.append((_shapes(points), APART_SHAPES, "moves otherwise than the others"))
@@ -399,7 +410,10 @@ def _outliers(demonstrations: Demonstrations) -> Iterator[Finding]:
 
 
 def _spreads_of_others(points: Tensor) -> Tensor:
-    """Standard deviations of all other demonstrations ``(demo, state)``, of points ``(demo, point, state)``, at least 0.1 of all."""
+    """Standard deviations of all other demonstrations ``(demo, state)``, of points ``(demo, point, state)``.
+
+    At least 0.1 of that of all.
+    """
     centred = points - points.mean(dim=(0, 1))
     first, second, count = centred.sum(dim=1), centred.square().sum(dim=1), (len(points) - 1) * points.shape[1]
     means, squares = (first.sum(dim=0) - first) / count, (second.sum(dim=0) - second) / count
