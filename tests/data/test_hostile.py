@@ -1,6 +1,7 @@
 """Files made to take the machine, and good files that must not be blamed: each through the program."""
 
 import json
+import shutil
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,7 +15,7 @@ from ftl_lightning.data.check import check
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.validation import parse_json
-from tests.conftest import refused, succeed
+from tests.conftest import ROOT, refused, succeed
 
 Told = pytest.CaptureFixture[str]
 STATES = np.cumsum(np.random.default_rng(0).normal(size=(3, 12, 2)), axis=1).astype(np.float32)
@@ -45,7 +46,7 @@ def test_a_json_text_of_tiny_parts_is_refused_before_it_is_parsed(name: str, cap
 def test_numbers_and_texts_of_json_are_checked_as_before() -> None:
     assert parse_json('[1, 2.5, "a", null, true, [], {"b": [0.5, 1.5]}]') == [1, 2.5, "a", None, True, [], {"b": [0.5, 1.5]}]
     for text in ("[1.5, 1e999]", "[1e999]", "[[0.5, NaN]]", '["a", "\\ud800"]', '{"a": "\\ud800"}', "[1, 2.5, Infinity]"):
-        with pytest.raises(UserError, match="expected (finite numbers|texts of Unicode)"):
+        with pytest.raises(UserError, match=r"expected (finite numbers|texts of Unicode)"):
             parse_json(text)
 
 
@@ -79,6 +80,7 @@ def test_an_array_twice_in_an_archive_is_refused(capsys: Told) -> None:
         refused(capsys, ["check", "x.npz"], "x.npz: key 'states': expected it once, found it several times")
 
 
+@pytest.mark.slow
 def test_of_many_demonstrations_and_concepts_the_first_are_checked(capsys: Told) -> None:
     states = np.random.default_rng(0).normal(size=(3000, 4, 1)).cumsum(axis=1)
     np.savez("many.npz", states=states, concepts="walk")
@@ -136,3 +138,17 @@ def test_lists_of_whole_numbers_and_texts_are_still_checked(capsys: Told) -> Non
     for lengths, expected in (([2, -1, 2], "lengths"), (["a"] * 3, "lengths")):
         Path("x.json").write_text(json.dumps({"states": STATES.tolist(), "lengths": lengths}))
         refused(capsys, ["check", "x.json"], "x.json", expected)
+
+
+@pytest.mark.parametrize("text", ["[" * 50_000, "{a: " * 20_000, "- " * 50_000, "a: " + "1:" + "9:" * 5000 + "1"])
+def test_a_configuration_that_is_too_deep_or_of_endless_digits_is_one_line(text: str, capsys: Told) -> None:
+    Path("c.yaml").write_text(text)
+    refused(capsys, ["fit", "--config", "c.yaml"], "c.yaml: expected a configuration file (YAML), found")
+
+
+def test_a_model_of_a_million_training_concepts_is_refused(capsys: Told) -> None:
+    shutil.copytree(ROOT / "pretrained" / "strokes", "model")
+    config = Path("model/config.json")
+    config.write_text(json.dumps(json.loads(config.read_text()) | {"training_concepts": ["a"] * 10**6}))
+    np.savez("five.npz", states=STATES, concepts="walk")
+    refused(capsys, ["invert", "model", "five.npz"], "model/config.json", "training_concepts", "20000")
