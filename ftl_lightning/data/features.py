@@ -19,6 +19,9 @@ Observed = Mapping[str, Tensor]
 READ = "(read)"  # no user's feature has this name
 """Key of encoded images ``(sample, n)``, in place of the images."""
 
+PINNED = "(pinned)"  # no user's feature has this name
+"""Key of known states ``(sample, horizon, state)`` that a plan has to pass, in the domain's units; NaN where nothing is known."""
+
 COARSE = 1e-4
 """Maximum spacing of float32 at a column's largest number, as a share of the column's range; more needs float64."""
 LARGEST_WHOLE = 2**53

@@ -5,6 +5,7 @@ from torch import Tensor
 
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.diffusion import Context, Denoiser
+from ftl_lightning.igm.forms.adapter import adapted
 
 
 def composed_epsilon(
@@ -23,7 +24,7 @@ def composed_epsilon(
     branch is a separate pass without gradient, since it depends on no learned parameter.
 
     An adapter modifies the denoiser in the branch of its concept. An adapter with ``everywhere`` also modifies the unconditional
-    branch, and those branches of its composition that have no adapter. Each adapter then needs a separate forward pass.
+    branch, and those branches of its composition that have no adapter. Several adapters may need a forward pass each.
 
     Args:
         denoiser: noise estimate with a single concept per sample.
@@ -46,11 +47,11 @@ def composed_epsilon(
     if composition.adapters:
         number, default = _adapter_numbers(composition, row)
         if default.any():
-            unconditional = branches(_by_adapter(denoiser, composition, default), x, t, empty, first, context)[0]
+            unconditional = branches(adapted(denoiser, composition.adapters, default), x, t, empty, first, context)[0]
         else:
             with torch.no_grad():
                 unconditional = branches(denoiser, x, t, empty, first, context)[0]
-        conditional = branches(_by_adapter(denoiser, composition, number.T.flatten()), x, t, concepts, index, context)
+        conditional = branches(adapted(denoiser, composition.adapters, number.T.flatten()), x, t, concepts, index, context)
     elif torch.is_grad_enabled() and components:
         with torch.no_grad():
             unconditional = branches(denoiser, x, t, empty, first, context)[0]
@@ -101,20 +102,3 @@ def _adapter_numbers(composition: Composition, row: Tensor) -> tuple[Tensor, Ten
     everywhere = [position * adapter.everywhere for position, adapter in enumerate(composition.adapters, start=1)]
     default = number.new_tensor([0, *everywhere])[number].amax(dim=1)
     return torch.where(number == 0, default[:, None], number), default
-
-
-def _by_adapter(denoiser: Denoiser, composition: Composition, number: Tensor) -> Denoiser:
-    """Denoiser that applies to each sample the adapter ``number (sample,)``, from 1; 0 for none. One forward pass per adapter."""
-
-    def estimate(x: Tensor, t: Tensor, concepts: Tensor, index: Tensor, context: Context) -> Tensor:
-        by_number = number.argsort(stable=True)
-        groups = by_number.split(number.bincount(minlength=1 + len(composition.adapters)).tolist())
-        noise = []
-        for adapter, samples in zip((None, *composition.adapters), groups, strict=True):
-            if len(samples):
-                adapted = denoiser if adapter is None else adapter(denoiser)
-                features = tuple(part[samples] for part in context)
-                noise.append(adapted(x[samples], t[samples], concepts, index[samples], features))
-        return torch.cat(noise)[by_number.argsort()]
-
-    return estimate

@@ -8,10 +8,11 @@ from torch import Tensor, nn
 
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import Observed
+from ftl_lightning.data.pinned import Pinned
 from ftl_lightning.igm.composition import Composition, batched
 from ftl_lightning.igm.concept import Origin
-from ftl_lightning.igm.diffusion import Context, denoising_loss, loss_weights, timesteps
-from ftl_lightning.igm.guidance import composed_epsilon
+from ftl_lightning.igm.diffusion import Context, add_noise, denoising_loss, loss_weights, timesteps
+from ftl_lightning.igm.guidance import branches, composed_epsilon
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.igm.settings import InversionSettings
 
@@ -75,6 +76,12 @@ class Invertible(Protocol):
 
     def losses(self, states: Tensor, observed: Observed, composition: Composition, draws: Draws | None, loss: str) -> Tensor:
         """Loss of Eq. 2 ``(run, sample)`` of windows ``(run * sample, window, state)`` under compositions ``(run, K, ...)``."""
+
+    def products(self, states: Tensor, observed: Observed, draws: Draws | None, loss: str) -> Tensor | None:
+        """Inner products of the branches of all N training concepts, see :meth:`DiffusionModel.branch_products`.
+
+        ``(sample, 1 + N, 1 + N)`` for windows ``(sample, window, state)``; ``None`` for a model without a composed denoiser.
+        """
 
     def sample(
         self,
@@ -144,6 +151,30 @@ class DiffusionModel(nn.Module):
         )
         return losses.unflatten(0, (runs, -1)) * loss_weights(loss, self.alpha_bar)[draws.t]
 
+    @torch.no_grad()
+    def branch_products(self, clean: Tensor, context: Context, embeddings: Tensor, draws: Draws, loss: str) -> Tensor:
+        """Inner products of the error of the unconditional branch and of what N embeddings add to that branch (Eq. 2).
+
+        The loss of a combination with weights w is ``|e - sum_k w_k d_k|^2``, where ``e = eps - eps(x, empty)`` and
+        ``d_k = eps(x, c_k) - eps(x, empty)``: a quadratic function of w, whose coefficients are these products.
+
+        Args:
+            clean: normalised plans ``(sample, horizon, state)``.
+            context: encoded observed features of each plan.
+            embeddings: ``(N, n)``.
+            draws, loss: see :meth:`composed_losses`.
+
+        Returns:
+            ``(sample, 1 + N, 1 + N)``: products of ``e, d_1 .. d_N`` with each other, means over the numbers of a plan.
+        """
+        x = add_noise(clean, draws.noise, self.alpha_bar[draws.t])
+        concepts = torch.cat((self.empty[None], embeddings))[:, None]
+        index = torch.arange(len(concepts), device=x.device)[:, None].expand(-1, len(x))
+        estimates = branches(self.denoiser, x, draws.t, concepts, index, context)
+        parts = torch.cat((draws.noise[None], estimates[1:])) - estimates[0]
+        flat = parts.flatten(2).transpose(0, 1)  # (sample, 1 + N, number)
+        return flat @ flat.mT / flat.shape[2] * loss_weights(loss, self.alpha_bar)[draws.t][:, None, None]
+
     def composed_plans(
         self,
         compositions: Sequence[Composition],
@@ -151,6 +182,7 @@ class DiffusionModel(nn.Module):
         sampling: Sampling,
         generators: Sequence[torch.Generator],
         context: Context,
+        pinned: Pinned | None = None,
     ) -> Tensor:
         """Sample normalised plans ``(composition * count, horizon, state)`` with the composed denoiser (section 4.3).
 
@@ -160,6 +192,7 @@ class DiffusionModel(nn.Module):
             sampling: sampler, number of steps and temperature.
             generators: random generator of each composition.
             context: encoded observed features of each plan.
+            pinned: known states of each plan, normalised; ``None`` for none.
         """
         batch, row = batched(compositions, count, generators)
 
@@ -171,4 +204,4 @@ class DiffusionModel(nn.Module):
             drawn = [torch.randn((count, *self.plan), generator=draw, device=draw.device) for draw in generators]
             return torch.cat(drawn).to(self.alpha_bar.device)
 
-        return sampling.run(epsilon, noise, self.alpha_bar)
+        return sampling.run(epsilon, noise, self.alpha_bar, pinned)

@@ -37,6 +37,8 @@ class MLPDenoiser(nn.Module):
     """
 
     over_time = False
+    by_sample = ("layers", "head")
+    """Linear layers whose rows are the samples of a batch, which low-rank adapters modify."""
 
     def __init__(
         self,

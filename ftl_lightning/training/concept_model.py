@@ -1,6 +1,7 @@
 """Base class of models: concept space, normalisation, and view of behaviour."""
 
 import difflib
+import functools
 import logging
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
@@ -10,7 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from ftl_lightning.data.demonstrations import Demonstrations
-from ftl_lightning.data.features import READ, Feature, Observed, check_features, moved
+from ftl_lightning.data.features import PINNED, READ, Feature, Observed, check_features, moved
+from ftl_lightning.data.places import Places, starts
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import EMPTY_CONCEPT, TRAINING_CONCEPT, Concept, Origin, Point
 from ftl_lightning.igm.forms.adapter import LowRank
@@ -293,6 +295,29 @@ class ConceptModel(Shown, nn.Module, ABC):
         """The inverse of :meth:`encode`."""
         states = self.normalization.decode(normalised)
         return states if self.view is None else self.view.decode(states, observed)
+
+    def known_states(self, observed: Observed) -> Tensor | None:
+        """Known states of plans ``(sample, horizon, state)`` in the domain's units, NaN where unknown; ``None`` without any.
+
+        States are known by the key :data:`~ftl_lightning.data.features.PINNED`, and, in a user's data, by observed features that
+        equal the initial state in every demonstration.
+        """
+        known = observed.get(PINNED)
+        if not self.starts:
+            return known
+        if known is None:
+            count = len(next(iter(observed.values())))
+            known = torch.full((count, self.horizon, len(self.domain.plans.columns)), torch.nan, device=self.device)
+        known = known.clone()
+        for name, columns in self.starts.items():
+            first = known[:, 0, list(columns)]
+            known[:, 0, list(columns)] = torch.where(first.isnan(), observed[name].flatten(1).to(known), first)
+        return known
+
+    @functools.cached_property
+    def starts(self) -> Places:
+        """Columns of the observed features that equal the initial state in all examples; empty for shipped domains."""
+        return {} if self.examples is None or not self.examples.observed else starts(self.examples)
 
     def vector(self, observed: Observed) -> Tensor | None:
         """Observation vector ``(batch, m)`` of the network: normalised vectors, then image encodings; ``None`` without any.

@@ -1,12 +1,14 @@
 """Low-rank adapters (LoRA, Hu et al., 2022), which modify the denoiser in the branch of a concept."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from ftl_lightning.igm.diffusion import Denoiser
+from ftl_lightning.igm.diffusion import Context, Denoiser
 from ftl_lightning.services.errors import UserError, require, short
 
 
@@ -82,6 +84,90 @@ KINDS = ("up", "down")
 
 
 def adaptable(network: nn.Module) -> dict[str, tuple[int, int]]:
-    """Sizes ``(outputs, everything else)`` of the adaptable weights, which are all matrices and convolutions, by name."""
+    """Sizes ``(outputs, everything else)`` of the weights that an adapter modifies, by name.
+
+    These are the matrices of the network's layers for each sample, if it names them in ``by_sample``, so that adapters are applied
+    together (:func:`adapted`); otherwise all matrices and convolutions.
+    """
+    layers = _by_sample(network)
     weights = {name: weight for name, weight in network.named_parameters() if weight.dim() > 1}
-    return {name: (len(weight), weight[0].numel()) for name, weight in weights.items()}
+    return {name: (len(weight), weight[0].numel()) for name, weight in weights.items() if not layers or name in layers}
+
+
+def _by_sample(network: nn.Module) -> set[str]:
+    """Names of the weights of linear layers whose rows are the samples of a batch; empty if the network does not name them."""
+    prefix, inner = ("net.", network.net) if isinstance(getattr(network, "net", None), nn.Module) else ("", network)
+    names = {f"{prefix}{layer}" for layer in getattr(inner, "by_sample", ())}
+    linear = [name for name, layer in network.named_modules() if isinstance(layer, nn.Linear)]
+    return {f"{name}.weight" for name in linear if any(name == one or name.startswith(f"{one}.") for one in names)}
+
+
+def adapted(denoiser: Denoiser, adapters: Sequence[Any], number: Tensor) -> Denoiser:
+    """Denoiser that applies to each sample the adapter ``number (sample,)``, from 1; 0 for none.
+
+    Adapters of layers for each sample take a single forward pass together, others a pass for each adapter.
+    """
+    low_rank = all(isinstance(adapter, LowRank) for adapter in adapters) and isinstance(denoiser, nn.Module)
+    if low_rank and len({frozenset(adapter.factors) for adapter in adapters}) == 1:
+        names = set(adapters[0].factors)
+        if names <= _by_sample(denoiser):
+
+            def together(x: Tensor, t: Tensor, concepts: Tensor, index: Tensor, context: Context) -> Tensor:
+                with _hooked(denoiser, adapters, number):
+                    return denoiser(x, t, concepts, index, context)
+
+            return together
+    return lambda *inputs: _one_by_one(denoiser, adapters, number, *inputs)
+
+
+@contextmanager
+def _hooked(network: nn.Module, adapters: Sequence[LowRank], number: Tensor) -> Iterator[None]:
+    """Add the low-rank updates to the outputs of the adapted layers: ``x W^T + (x down^T) up^T``."""
+    order = number.argsort(stable=True)
+    counts = number.bincount(minlength=1 + len(adapters)).tolist()
+    used = [position for position, count in enumerate(counts) if count]
+    even = len({counts[position] for position in used}) == 1
+    groups = order.split([counts[position] for position in used])
+    ordered = bool((number.diff() >= 0).all())
+    handles = []
+    for name in adapters[0].factors:
+        pairs = [adapter.factors[name] for adapter in adapters]
+        up, down = (torch.stack([torch.zeros_like(pairs[0][kind]), *(pair[kind] for pair in pairs)]) for kind in (0, 1))
+        up, down = up[used].to(number.device), down[used].to(number.device)
+
+        def add(module: nn.Module, inputs: tuple[Tensor], output: Tensor, up: Tensor = up, down: Tensor = down) -> Tensor:
+            x = inputs[0] if ordered else inputs[0][order]
+            if even:
+                update = ((x.unflatten(0, (len(used), -1)) @ down.mT) @ up.mT).flatten(0, 1)
+            else:
+                parts = zip(x.split([len(group) for group in groups]), up, down, strict=True)
+                update = torch.cat([(part @ low.mT) @ high.mT for part, high, low in parts])
+            return output + (update if ordered else update[order.argsort()])
+
+        handles.append(network.get_submodule(name.rpartition(".")[0]).register_forward_hook(add))
+    try:
+        yield
+    finally:
+        for handle in handles:
+            handle.remove()
+
+
+def _one_by_one(
+    denoiser: Denoiser,
+    adapters: Sequence[Any],
+    number: Tensor,
+    x: Tensor,
+    t: Tensor,
+    concepts: Tensor,
+    index: Tensor,
+    context: Context,
+) -> Tensor:
+    by_number = number.argsort(stable=True)
+    groups = by_number.split(number.bincount(minlength=1 + len(adapters)).tolist())
+    noise = []
+    for adapter, samples in zip((None, *adapters), groups, strict=True):
+        if len(samples):
+            changed = denoiser if adapter is None else adapter(denoiser)
+            features = tuple(part[samples] for part in context)
+            noise.append(changed(x[samples], t[samples], concepts, index[samples], features))
+    return torch.cat(noise)[by_number.argsort()]

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from ftl_lightning import networks
 from ftl_lightning.data.features import Observed
+from ftl_lightning.data.pinned import Pinned
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.diffusion import MOST_STEPS, PREDICTIONS, Context, Prediction, cosine_alpha_bar
 from ftl_lightning.igm.forms.adapter import LowRank, adaptable
@@ -109,6 +110,11 @@ class GenerativeModel(DiffusionModel, TextConceptModel):
         context = self.observe(observed)
         return self.composed_losses(self.encode(states, observed), context, composition, draws, loss)
 
+    def products(self, states: Tensor, observed: Observed, draws: Draws | None, loss: str) -> Tensor:
+        assert draws is not None
+        clean = self.encode(states, observed)
+        return self.branch_products(clean, self.observe(observed), self.training_embeddings, draws, loss)
+
     @torch.no_grad()
     def sample(
         self,
@@ -119,5 +125,12 @@ class GenerativeModel(DiffusionModel, TextConceptModel):
         observed: Observed | None = None,
     ) -> Tensor:
         features = observed or {}
-        plans = self.composed_plans(compositions, count, sampling, generators, self.observe(features))
-        return self.decode(plans, features).unflatten(0, (len(compositions), count))
+        known, pinned = self.known_states(features), None
+        if known is not None:
+            values = self.encode(known, features)  # NaN where a number depends on an unknown state
+            pinned = Pinned(~values.isnan(), values.nan_to_num())
+        plans = self.composed_plans(compositions, count, sampling, generators, self.observe(features), pinned)
+        states = self.decode(plans, features)
+        if known is not None:
+            states = torch.where(known.isnan(), states, known)
+        return states.unflatten(0, (len(compositions), count))

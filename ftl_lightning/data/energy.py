@@ -1,0 +1,107 @@
+"""Energy scores of samples: a proper score that needs no judge (Gneiting & Raftery, 2007), on features that see shape.
+
+The energy score of samples X of a distribution, for a demonstration y, is ``E |X - y| - E |X - X'| / 2``. Its mean over
+demonstrations is least for the distribution that they come from: copies, blur, noise and a wrong place all raise it. On raw paths it
+hardly sees shape, so it is also taken on differences, on random convolutions and on spectra.
+"""
+
+import math
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from ftl_lightning.services.randomness import generator
+
+FEATURES = ("path", "differences", "convolutions", "spectrum")
+"""Features of a path, each with an energy score."""
+KERNELS, WIDTH = 100, 7
+"""Random convolutions, and their number of times."""
+QUIET = 1e-3
+"""Amplitude that is added to spectra before the logarithm, relative to a column's standard deviation."""
+PAIRED = 200
+"""Maximum number of real paths whose mutual distances are the unit of a feature."""
+
+
+class PathFeatures:
+    """Features of paths, whitened by real behaviour.
+
+    Args:
+        real: paths ``(path, horizon, state)``, such as those of all training concepts; two or more.
+
+    Attributes:
+        units: mean distance between real paths, of each feature.
+    """
+
+    def __init__(self, real: Tensor) -> None:
+        self.spread = _spread(real.flatten(0, 1))
+        draw = generator("cpu", 0, 7)
+        state, horizon = real.shape[2], real.shape[1]
+        width = min(WIDTH, horizon)
+        kernels = torch.randn(KERNELS, state, width, generator=draw)
+        kernels = kernels - kernels.mean(dim=2, keepdim=True) * (width > 1)
+        kernels = kernels * (torch.rand(KERNELS, state, 1, generator=draw) < max(2 / state, 0.3))
+        self.kernels = kernels / kernels.flatten(1).norm(dim=1).clamp(min=1e-6)[:, None, None]
+        most = math.log2(max((horizon - 1) / max(width - 1, 1), 1))
+        self.dilations = (2 ** (most * torch.rand(KERNELS, generator=draw))).long().tolist()
+        some = torch.randperm(len(real), generator=draw)[:PAIRED]
+        self.units = [_mean_distance(values) for values in self(real[some])]
+
+    def __call__(self, paths: Tensor) -> list[Tensor]:
+        """Features ``(path, n)`` of paths ``(path, horizon, state)``, by :data:`FEATURES`; short paths have the first alone."""
+        scaled = paths / self.spread
+        if paths.shape[1] < 3:
+            return [scaled.flatten(1)]
+        convolved = []
+        for kernel, dilation in zip(self.kernels, self.dilations, strict=True):
+            values = functional.conv1d(scaled.transpose(1, 2), kernel[None], dilation=dilation)[:, 0]
+            convolved += [values.amax(dim=1), values.amin(dim=1), (values > 0).float().mean(dim=1), values.std(dim=1, correction=0)]
+        amplitudes = torch.fft.rfft(scaled - scaled.mean(dim=1, keepdim=True), dim=1).abs()
+        quiet = QUIET * paths.shape[1] ** 0.5
+        return [
+            scaled.flatten(1),
+            scaled.diff(dim=1).flatten(1),
+            torch.stack(convolved, dim=1),
+            (amplitudes + quiet).log().flatten(1),
+        ]
+
+    def scores(self, samples: Tensor, truth: Tensor) -> Tensor:
+        """Energy scores ``(demo, feature)`` of samples ``(demo, sample, horizon, state)`` for ``(demo, horizon, state)``.
+
+        0 is exact, and 1 the distance between two paths of the real behaviour. The second expectation is over pairs of different
+        samples, so that the score does not depend on their number; a single sample has a score without it.
+        """
+        demos, count = samples.shape[:2]
+        features = zip(self(samples.flatten(0, 1)), self(truth), self.units, strict=True)
+        return torch.stack([_energy(values.unflatten(0, (demos, count)), real) / unit for values, real, unit in features], dim=1)
+
+
+def _energy(samples: Tensor, truth: Tensor) -> Tensor:
+    """Energy scores ``(demo,)`` of samples ``(demo, sample, n)`` for ``(demo, n)``."""
+    apart = (samples - truth[:, None]).norm(dim=2).mean(dim=1)
+    count = samples.shape[1]
+    among = torch.cdist(samples, samples).sum(dim=(1, 2)) / max(count * (count - 1), 1)
+    return apart - among / 2
+
+
+def _mean_distance(values: Tensor) -> Tensor:
+    """Mean distance between different rows ``(path, n)``."""
+    count = len(values)
+    return (torch.cdist(values, values).sum() / max(count * (count - 1), 1)).clamp(min=1e-12)
+
+
+def _spread(values: Tensor) -> Tensor:
+    """Standard deviation of columns ``(row, n)``; infinite for constant columns, which then count nothing."""
+    spread = values.std(dim=0, correction=0)
+    return torch.where(spread > 1e-6 * spread.max(), spread, torch.inf)
+
+
+def ceiling(features: PathFeatures, demonstrations: Tensor) -> Tensor:
+    """Energy score ``(feature,)`` of fresh demonstrations of the same kind, without bias: half the mean distance between two.
+
+    Args:
+        demonstrations: ``(demo, horizon, state)``, two or more, nothing observed.
+    """
+    return torch.stack(
+        [_mean_distance(values) / 2 / unit for values, unit in zip(features(demonstrations), features.units, strict=True)]
+    )

@@ -1,0 +1,129 @@
+"""Observed features that are places: positions in the space in which a plan moves, such as its start, an object, a goal."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Self
+
+import torch
+from torch import Tensor
+
+from ftl_lightning.data.demonstrations import Demonstrations
+from ftl_lightning.data.features import Observed
+
+Places = Mapping[str, tuple[int, ...]]
+"""Columns of the state in the same frame as an observed vector, by the name of the feature."""
+
+EQUAL = 1e-4
+"""Maximum difference of the initial state from a feature that equals it, relative to the columns' range."""
+FOLLOWED = 0.1
+"""Maximum variance of the distance to a place, at the time at which a concept follows it most, relative to the place's variance."""
+RIDGE, WINDOW = 0.01, 0.05
+"""Ridge penalty of the shares with which paths follow places, relative to the places' mean square; half width of the window of
+times that share an estimate, as a share of the horizon.
+"""
+
+
+def first_windows(demonstrations: Demonstrations, horizon: int) -> Tensor:
+    """First windows of demonstrations ``(demo, horizon, state)``; the last state of a shorter demonstration is repeated."""
+    rows = torch.arange(len(demonstrations))
+    return demonstrations.windows(rows, torch.zeros_like(rows), horizon)[0]
+
+
+def _vectors(demonstrations: Demonstrations) -> dict[str, Tensor]:
+    """Observed vectors at time 0 ``(demo, size)`` by name, without images."""
+    observed = demonstrations.initial_states.observed
+    return {name: values.flatten(1) for name, values in observed.items() if values.dtype != torch.uint8}
+
+
+def _windows(size: int, units: tuple[str, ...], width: int) -> list[tuple[int, ...]]:
+    """Adjacent columns, as many as the feature has numbers, of the same unit."""
+    groups = [tuple(range(first, first + size)) for first in range(width - size + 1)]
+    return [group for group in groups if len({units[column] for column in group} if units else {""}) == 1]
+
+
+def starts(demonstrations: Demonstrations) -> Places:
+    """Features that equal columns of the initial state in every demonstration."""
+    first, found = demonstrations.states[:, 0], {}
+    spread = first.amax(dim=0) - first.amin(dim=0)
+    for name, values in _vectors(demonstrations).items():
+        for columns in _windows(values.shape[1], demonstrations.state_units, first.shape[1]):
+            chosen = list(columns)
+            near = (first[:, chosen] - values).abs().amax(dim=0) <= EQUAL * spread[chosen]
+            if near.all() and (spread[chosen] > 0).all():
+                found[name] = columns
+                break
+    return found
+
+
+def places(demonstrations: Demonstrations, horizon: int) -> Places:
+    """Features that paths of some concept follow: at some time the path varies with the feature, and hardly beside it.
+
+    Args:
+        demonstrations: demonstrations of training concepts, several of each.
+        horizon: number of states that are compared.
+    """
+    paths, texts = first_windows(demonstrations, horizon), demonstrations.concepts
+    rows = [[row for row, text in enumerate(texts) if text == name] for name in dict.fromkeys(texts)]
+    found: dict[str, tuple[int, ...]] = dict(starts(demonstrations))
+    for name, values in _vectors(demonstrations).items():
+        best = {}
+        for columns in _windows(values.shape[1], demonstrations.state_units, paths.shape[2]):
+            shares = [
+                ((paths[some][..., list(columns)] - values[some][:, None]).var(dim=0) / values[some].var(dim=0).clamp(min=1e-12))
+                .amax(dim=1)
+                .min()
+                for some in rows
+                if len(some) > 2
+            ]
+            best[columns] = float(min(shares, default=torch.tensor(torch.inf)))
+        if name not in found and best and min(best.values()) <= FOLLOWED:
+            found[name] = min(best, key=lambda columns: best[columns])
+    return found
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Shares with which a concept's paths follow each place, by time: ``x(t) = u(t) + sum_p share_p(t) place_p``.
+
+    What remains, u, does not depend on where things are. Task-parameterised models (Calinon, 2016) weigh frames by the inverse of
+    their covariances; here the shares are a ridge regression of the differences among demonstrations.
+
+    Attributes:
+        places: columns of each place.
+        shares: ``(place, time)``.
+    """
+
+    places: Places
+    shares: Tensor
+
+    @classmethod
+    def fit(cls, paths: Tensor, observed: Observed, known: Places) -> Self:
+        """Fit to a few paths ``(demo, horizon, state)`` of one concept and their observed features ``(demo, ...)``."""
+        named = {name: columns for name, columns in known.items() if name in observed}
+        count, horizon, width = paths.shape
+        if not named or count < 2:
+            return cls({}, paths.new_zeros(0, horizon))
+        spread = (paths - paths.mean(dim=0)).square().mean(dim=(0, 1)).sqrt()
+        scale = torch.where(spread > 0, spread, torch.inf)
+        moved = paths.new_zeros(len(named), count, width)
+        for number, (name, columns) in enumerate(named.items()):
+            values = observed[name].flatten(1).to(paths)
+            moved[number][:, list(columns)] = values - values.mean(dim=0)
+        regressors = (moved / scale).flatten(1)  # (place, demo * state)
+        targets = ((paths - paths.mean(dim=0)) / scale).transpose(0, 1).flatten(1)  # (time, demo * state)
+        time = torch.arange(horizon)
+        near = ((time[:, None] - time).abs() <= WINDOW * horizon).to(paths)
+        targets = near @ targets / near.sum(dim=1, keepdim=True)
+        gram = regressors @ regressors.T
+        penalty = RIDGE * gram.diagonal().mean() * torch.eye(len(gram))
+        return cls(named, torch.linalg.solve(gram + penalty, regressors @ targets.T))
+
+    def shift(self, observed: Observed, width: int) -> Tensor:
+        """What the places add to paths ``(sample, horizon, state)``; ``(1, horizon, state)`` of zeros without places."""
+        total = self.shares.new_zeros(1, self.shares.shape[1], width)
+        for share, (name, columns) in zip(self.shares, self.places.items(), strict=True):
+            values = observed[name].flatten(1).to(self.shares)
+            added = self.shares.new_zeros(len(values), self.shares.shape[1], width)
+            added[..., list(columns)] = share[:, None] * values[:, None]
+            total = total + added
+        return total
