@@ -1,8 +1,8 @@
 """Energy scores of samples: a proper score that needs no judge (Gneiting & Raftery, 2007), on features that see shape.
 
 The energy score of samples X of a distribution, for a demonstration y, is ``E |X - y| - E |X - X'| / 2``. Its mean over
-demonstrations is least for the distribution that they come from: copies, blur, noise and a wrong place all raise it. On raw paths it
-hardly sees shape, so it is also taken on differences, on random convolutions and on spectra.
+demonstrations is least for the distribution that they come from: copies, blur, noise and a wrong place all raise it. On raw paths
+it hardly sees shape, so it is also taken on differences, on random convolutions and on spectra.
 """
 
 import math

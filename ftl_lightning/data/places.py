@@ -29,10 +29,10 @@ def first_windows(demonstrations: Demonstrations, horizon: int) -> Tensor:
     return demonstrations.windows(rows, torch.zeros_like(rows), horizon)[0]
 
 
-def _vectors(demonstrations: Demonstrations) -> dict[str, Tensor]:
+def vectors_of(demonstrations: Demonstrations) -> dict[str, Tensor]:
     """Observed vectors at time 0 ``(demo, size)`` by name, without images."""
     observed = demonstrations.initial_states.observed
-    return {name: values.flatten(1) for name, values in observed.items() if values.dtype != torch.uint8}
+    return {name: values.flatten(1).float() for name, values in observed.items() if values.dtype != torch.uint8}
 
 
 def _windows(size: int, units: tuple[str, ...], width: int) -> list[tuple[int, ...]]:
@@ -45,7 +45,7 @@ def starts(demonstrations: Demonstrations) -> Places:
     """Features that equal columns of the initial state in every demonstration."""
     first, found = demonstrations.states[:, 0], {}
     spread = first.amax(dim=0) - first.amin(dim=0)
-    for name, values in _vectors(demonstrations).items():
+    for name, values in vectors_of(demonstrations).items():
         for columns in _windows(values.shape[1], demonstrations.state_units, first.shape[1]):
             chosen = list(columns)
             near = (first[:, chosen] - values).abs().amax(dim=0) <= EQUAL * spread[chosen]
@@ -65,7 +65,7 @@ def places(demonstrations: Demonstrations, horizon: int) -> Places:
     paths, texts = first_windows(demonstrations, horizon), demonstrations.concepts
     rows = [[row for row, text in enumerate(texts) if text == name] for name in dict.fromkeys(texts)]
     found: dict[str, tuple[int, ...]] = dict(starts(demonstrations))
-    for name, values in _vectors(demonstrations).items():
+    for name, values in vectors_of(demonstrations).items():
         best = {}
         for columns in _windows(values.shape[1], demonstrations.state_units, paths.shape[2]):
             shares = [

@@ -1,7 +1,8 @@
 """Behaviour made of demonstrations without learning: what a learned concept has to beat."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -9,7 +10,9 @@ from torch import Tensor
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import Observed
 from ftl_lightning.data.pinned import Pinned
-from ftl_lightning.data.places import Frames, Places, first_windows, places, starts
+from ftl_lightning.data.places import Frames, Places, first_windows, places, starts, vectors_of
+from ftl_lightning.services.errors import require, short
+from ftl_lightning.services.validation import from_mapping
 
 NEAREST, SHIFTED, WARPED, GAUSSIAN = NAMES = (
     "nearest demonstration",
@@ -17,7 +20,7 @@ NEAREST, SHIFTED, WARPED, GAUSSIAN = NAMES = (
     "warped demonstrations",
     "Gaussian of demonstrations",
 )
-"""References by name, see :class:`References`."""
+"""References by name, see :class:`Reference`."""
 SHARE = 0.5
 """Standard deviation of warping, as a share of the standard deviation within training concepts."""
 BEND = 0.4
@@ -31,7 +34,6 @@ class Setting:
     Attributes:
         places: columns of each observed place.
         starts: columns of each observed feature that equals the initial state.
-        spread: standard deviation of each column ``(state,)``; infinite for a constant column.
         observed_spread: standard deviation of each observed vector ``(size,)`` by name.
         place: standard deviation of a path's mean within concepts ``(state,)``.
         size: standard deviation of the logarithm of a path's size within concepts.
@@ -39,7 +41,6 @@ class Setting:
 
     places: Places
     starts: Places
-    spread: Tensor
     observed_spread: Observed
     place: Tensor
     size: float
@@ -47,18 +48,17 @@ class Setting:
     @classmethod
     def of(cls, training: Demonstrations, horizon: int) -> Self:
         """Measure demonstrations of training concepts, two or more of each."""
-        paths, texts = first_windows(training, horizon).float(), training.concepts
+        paths, texts = first_windows(training, horizon), training.concepts
         spread = paths.flatten(0, 1).std(dim=0, correction=0)
         spread = torch.where(spread > 1e-6 * spread.max(), spread, torch.inf)
         rows = [[row for row, text in enumerate(texts) if text == name] for name in dict.fromkeys(texts)]
         several = [paths[some] for some in rows if len(some) > 1]
-        place, sizes = torch.zeros_like(spread), torch.zeros(1)
+        place, sizes = paths.new_zeros(paths.shape[2]), torch.zeros(1)
         if several:
             place = torch.stack([some.mean(dim=1).var(dim=0) for some in several]).mean(dim=0).sqrt()
             sizes = torch.stack([_size(some, spread).log().var() for some in several]).mean().sqrt()
-        vectors = {name: values.flatten(1).float() for name, values in training.initial_states.observed.items()}
-        seen = {name: values.std(dim=0, correction=0).clamp(min=1e-9) for name, values in vectors.items()}
-        return cls(places(training, horizon), starts(training), spread, seen, place, float(sizes))
+        seen = {name: values.std(dim=0, correction=0).clamp(min=1e-9) for name, values in vectors_of(training).items()}
+        return cls(places(training, horizon), starts(training), seen, place, float(sizes))
 
 
 def _size(paths: Tensor, spread: Tensor) -> Tensor:
@@ -66,8 +66,9 @@ def _size(paths: Tensor, spread: Tensor) -> Tensor:
     return ((paths - paths.mean(dim=1, keepdim=True)) / spread).square().mean(dim=(1, 2)).sqrt().clamp(min=1e-6)
 
 
-class References:
-    """Samples made of a few demonstrations of one concept.
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """A sampler made of a few demonstrations of one concept.
 
     The *nearest demonstration* is the one that observes most alike; without observations, each in turn. The *shifted demonstration*
     is moved by the differences of observed places, with the shares of :class:`~ftl_lightning.data.places.Frames`. *Warped
@@ -75,54 +76,62 @@ class References:
     demonstrations* has their mean and covariance (a probabilistic movement primitive, Paraschos et al., 2013). Where the initial
     state is observed, all but the nearest demonstration begin there.
 
-    Args:
-        demonstrations: demonstrations of one concept.
+    Attributes:
+        name: one of :data:`NAMES`.
+        paths: first windows of the demonstrations ``(demo, horizon, state)``, in the domain's units.
+        observed: observed vectors of the demonstrations ``(demo, size)`` by name; images are left out.
         setting: see :class:`Setting`.
-        horizon: number of states in a sample.
     """
 
-    def __init__(self, demonstrations: Demonstrations, setting: Setting, horizon: int) -> None:
-        self.setting, self.observed = setting, demonstrations.initial_states.observed
-        self.paths = first_windows(demonstrations, horizon).float()
-        self.frames = Frames.fit(self.paths, self.observed, setting.places)
-        self.rest = self.paths - self.frames.shift(self.observed, self.paths.shape[2])
+    name: str
+    paths: Tensor
+    observed: Observed
+    setting: Setting
 
-    def sample(self, name: str, observed: Observed, starts: int, count: int, draw: torch.Generator) -> Tensor:
-        """Samples ``(start, sample, horizon, state)`` of a reference of :data:`NAMES`.
+    def __post_init__(self) -> None:
+        require(self.name in NAMES, "form", f"one of {', '.join(NAMES)}", repr(self.name))
 
-        Args:
-            observed: features ``(start, ...)`` by name; empty for none.
-            starts: number of starts.
-            count: number of samples for each start.
-            draw: random generator of warps and of Gaussians.
+    @classmethod
+    def of(cls, name: str, demonstrations: Demonstrations, setting: Setting, horizon: int) -> Self:
+        """Make a reference of demonstrations of one concept."""
+        return cls(name, first_windows(demonstrations, horizon), vectors_of(demonstrations), setting)
+
+    def sample(self, observed: Observed, count: int, draw: torch.Generator) -> Tensor:
+        """Samples ``(count, horizon, state)`` for observed features ``(count, ...)`` by name; empty for none.
+
+        ``draw`` is the random generator of warps and of Gaussians, on the CPU.
         """
-        index = self._nearest(observed, starts, count)
-        if name == NEAREST:
-            return self.paths[index].unflatten(0, (starts, count))
-        every = {key: values.repeat_interleave(count, dim=0) for key, values in observed.items()}
-        rest = self.rest[index]
-        if name == WARPED:
-            rest = self._warped(self.rest[self._each(len(index), draw)], draw)
-        elif name == GAUSSIAN:
-            rest = self._drawn(len(index), draw)
-        moved = rest + self.frames.shift(every, rest.shape[2])
-        return self._started(moved, every).unflatten(0, (starts, count))
+        seen = {key: observed[key].flatten(1).float().cpu() for key in self.observed}
+        index = self._nearest(seen, count)
+        if self.name == NEAREST:
+            return self.paths[index]
+        frames = Frames.fit(self.paths, self.observed, self.setting.places)
+        width = self.paths.shape[2]
+        rest = self.paths - frames.shift(self.observed, width)
+        if self.name == WARPED:
+            shift = not frames.places
+            chosen = self._warped(rest[self._each(count, draw)], shift, draw)
+        elif self.name == GAUSSIAN:
+            chosen = _drawn(rest, count, draw)
+        else:
+            chosen = rest[index]
+        return self._started(chosen + frames.shift(seen, width), seen)
 
-    def _nearest(self, observed: Observed, starts: int, count: int) -> Tensor:
-        """Index of the demonstration of each sample ``(start * count,)``."""
+    def _nearest(self, observed: Observed, count: int) -> Tensor:
+        """Index of the demonstration of each sample ``(count,)``."""
         if not observed:
-            return torch.arange(starts * count) % len(self.paths)
-        apart = torch.zeros(starts, len(self.paths))
+            return torch.arange(count) % len(self.paths)
+        apart = torch.zeros(count, len(self.paths))
         for key, values in observed.items():
             scale = self.setting.observed_spread[key]
-            apart += torch.cdist(values.flatten(1).float() / scale, self.observed[key].flatten(1).float() / scale).square()
-        return apart.argmin(dim=1).repeat_interleave(count)
+            apart += torch.cdist(values / scale, self.observed[key] / scale).square()
+        return apart.argmin(dim=1)
 
     def _each(self, count: int, draw: torch.Generator) -> Tensor:
         """Index of a random demonstration for each sample, each demonstration equally often."""
         return torch.cat([torch.randperm(len(self.paths), generator=draw) for _ in range(-(-count // len(self.paths)))])[:count]
 
-    def _warped(self, paths: Tensor, draw: torch.Generator) -> Tensor:
+    def _warped(self, paths: Tensor, shift: bool, draw: torch.Generator) -> Tensor:
         count, horizon, width = paths.shape
         even = torch.linspace(0, 1, horizon)
         bend = BEND * (2 * torch.rand(count, 1, generator=draw) - 1)
@@ -134,20 +143,71 @@ class References:
         size = torch.exp(SHARE * self.setting.size * torch.randn(count, 1, 1, generator=draw))
         mean = bent.mean(dim=1, keepdim=True)
         place = SHARE * self.setting.place * torch.randn(count, 1, width, generator=draw)
-        return mean + (bent - mean) * size + (0 if self.frames.places else place)
-
-    def _drawn(self, count: int, draw: torch.Generator) -> Tensor:
-        demos = len(self.rest)
-        weights = torch.randn(count, demos, generator=draw) / max(demos - 1, 1) ** 0.5
-        mean = self.rest.mean(dim=0)
-        return mean + torch.einsum("sd,dhc->shc", weights, self.rest - mean)
+        return mean + (bent - mean) * size + shift * place
 
     def _started(self, paths: Tensor, observed: Observed) -> Tensor:
         """Paths that begin at the observed initial state."""
-        if not self.setting.starts:
+        known = {key: columns for key, columns in self.setting.starts.items() if key in observed}
+        if not known:
             return paths
         mask, values = torch.zeros_like(paths, dtype=torch.bool), torch.zeros_like(paths)
-        for key, columns in self.setting.starts.items():
+        for key, columns in known.items():
             mask[:, 0, list(columns)] = True
-            values[:, 0, list(columns)] = observed[key].flatten(1).float()
+            values[:, 0, list(columns)] = observed[key]
         return Pinned(mask, values)(paths)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Tensors of a file, by name."""
+        named = {"paths": self.paths, "place": self.setting.place}
+        named |= {f"observed/{key}": values for key, values in self.observed.items()}
+        return named | {f"observed_spread/{key}": values for key, values in self.setting.observed_spread.items()}
+
+    @property
+    def header(self) -> dict[str, Any]:
+        """Header of a file: what is not a tensor."""
+        setting = self.setting
+        return {"name": self.name, "places": dict(setting.places), "starts": dict(setting.starts), "size": setting.size}
+
+    @classmethod
+    def from_file(cls, tensors: Mapping[str, Tensor], header: Any) -> Self:
+        """Inverse of :meth:`tensors` and :attr:`header`; ``UserError`` for what does not fit."""
+        contents = from_mapping(_Header, header, "reference")
+        observed, spreads = (
+            {name.removeprefix(prefix): values for name, values in tensors.items() if name.startswith(prefix)}
+            for prefix in ("observed/", "observed_spread/")
+        )
+        missing = {"paths", "place"} - set(tensors)
+        require(not missing, "key 'reference'", "paths and place", f"no {', '.join(sorted(missing))}")
+        paths, place = tensors["paths"], "key 'reference'"
+        require(paths.dim() == 3 and all(paths.shape), f"{place}: paths", "(demo, horizon, state)", tuple(paths.shape))
+        require(
+            tensors["place"].shape == paths.shape[2:], f"{place}: place", str(tuple(paths.shape[2:])), tuple(tensors["place"].shape)
+        )
+        require(set(observed) == set(spreads), place, "a spread of each observed feature", ", ".join(sorted(spreads)) or "none")
+        for key, values in observed.items():
+            fits = values.dim() == 2 and len(values) == len(paths) and spreads[key].shape == values.shape[1:]
+            require(fits, f"{place}: observed/{short(key)}", "(demo, size)", tuple(values.shape))
+        for name, values in tensors.items():
+            require(values.dtype in (torch.float32, torch.float64), f"{place}: {short(name)}", "float32 or float64", values.dtype)
+        known = {**contents.places, **contents.starts}
+        for key, columns in known.items():
+            fits = key in observed and len(columns) == observed[key].shape[1] and all(0 <= c < paths.shape[2] for c in columns)
+            require(fits, f"{place}: places", "columns of the state for each number of an observed feature", short(key))
+        setting = Setting(contents.places, contents.starts, spreads, tensors["place"], contents.size)
+        return cls(contents.name, paths, observed, setting)
+
+
+@dataclass(frozen=True)
+class _Header:
+    name: str
+    places: Mapping[str, tuple[int, ...]]
+    starts: Mapping[str, tuple[int, ...]]
+    size: float
+
+
+def _drawn(paths: Tensor, count: int, draw: torch.Generator) -> Tensor:
+    """Samples ``(count, horizon, state)`` of a Gaussian with the mean and covariance of paths ``(demo, horizon, state)``."""
+    demos = len(paths)
+    weights = torch.randn(count, demos, generator=draw) / max(demos - 1, 1) ** 0.5
+    mean = paths.mean(dim=0)
+    return mean + torch.einsum("sd,dhc->shc", weights, paths - mean)

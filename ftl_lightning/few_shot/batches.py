@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import InitialStates, Observed, take
+from ftl_lightning.data.pinned import Pinned
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.samplers import Epsilon, Noise, Sampling
@@ -26,13 +27,13 @@ class _Part(Sampling):
     noise: Noise | None = None
     advance: Callable[[], None] = field(default=lambda: None)
 
-    def run(self, epsilon: Epsilon, noise: Noise, alpha_bar: Tensor) -> Tensor:
+    def run(self, epsilon: Epsilon, noise: Noise, alpha_bar: Tensor, pinned: Pinned | None = None) -> Tensor:
         def predict(x: Tensor, t: Tensor) -> Tensor:
             predicted = epsilon(x, t)
             self.advance()
             return predicted
 
-        return super().run(predict, self.noise or noise, alpha_bar)
+        return super().run(predict, self.noise or noise, alpha_bar, pinned)
 
 
 def sampled(

@@ -1,6 +1,6 @@
 """Compositions of concepts: addition, scaling by weights, and batching."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from numbers import Real
 from typing import Any, Protocol
@@ -26,6 +26,17 @@ class Adapter(Protocol):
         """The modified denoiser."""
 
 
+class Maker(Protocol):
+    """Makes behaviour without the model, see :class:`ftl_lightning.data.references.Reference`."""
+
+    @property
+    def name(self) -> str:
+        """Name of the form."""
+
+    def sample(self, observed: Mapping[str, Tensor], count: int, draw: torch.Generator, /) -> Tensor:
+        """Samples ``(count, horizon, state)`` in the domain's units for observed features ``(count, ...)``."""
+
+
 def space_of(domain: str, model_hash: str) -> str:
     """Description of a concept space: the model's ``domain`` and ``model_hash``."""
     return f"{domain} (hash {model_hash})"
@@ -46,6 +57,8 @@ class Composition(Shown):
         adapters: modifications of the denoiser, assigned to concepts by ``adapter``.
         adapter: ``(..., K)`` int64, number of each concept's adapter, from 1; 0 for the unmodified denoiser; ``None`` for zeros.
         alone: composition for sampling the concept alone; ``None`` for this composition.
+        made: maker of samples without the model; ``None`` for samples of the composed denoiser. Compositions of several concepts
+            ignore it.
         space: concept space, see :func:`space_of`; empty if unknown.
 
     Raises:
@@ -59,6 +72,7 @@ class Composition(Shown):
     adapters: tuple[Adapter, ...] = field(default=(), kw_only=True)
     adapter: Tensor | None = field(default=None, kw_only=True)
     alone: "Composition | None" = field(default=None, kw_only=True)
+    made: Maker | None = field(default=None, kw_only=True)
     space: str = field(default="", kw_only=True)
 
     def __post_init__(self) -> None:
@@ -86,6 +100,8 @@ class Composition(Shown):
             yield "on some columns"
         if self.adapters:
             yield counted(len(self.adapters), "adapter")
+        if self.made is not None:
+            yield self.made.name
         if self.alone is not None:
             yield "another form where it stands alone"
         yield f"of {self.space or 'any model'}"

@@ -9,6 +9,7 @@ from typing import NamedTuple, Self
 import torch
 from torch import Tensor
 
+from ftl_lightning.data.references import Reference
 from ftl_lightning.igm.composition import Composition, space_of
 from ftl_lightning.igm.forms.adapter import LowRank
 from ftl_lightning.igm.forms.modes import STRETCH, Modes
@@ -27,6 +28,8 @@ COMPOSING = ("composing_embeddings", "composing_weights")
 """Tensors that replace all others when composing; only in files of concepts with such a set."""
 ADAPTER = "adapter/"
 """Prefix of the tensors of an adapter."""
+REFERENCE = "reference/"
+"""Prefix of the tensors of a reference."""
 EMPTY_CONCEPT, TRAINING_CONCEPT, NEW_COMPONENT = "empty concept", "training concept", "new component"
 """Values of :attr:`Point.set`."""
 
@@ -157,6 +160,8 @@ class Concept(Shown):
         choice: how the form was selected; ``None`` if the user set it.
         composing: embeddings ``(K, knots, n)`` and weights ``(K,)`` that replace all others, and the adapter, when composing;
             ``None`` to compose the concept as it is alone.
+        reference: maker of the concept's samples without the model, such as a shifted demonstration; ``None`` for samples of the
+            model. Composing uses the embeddings.
         quality: quality of the samples; ``None`` if not measured. Optional key of the file's header.
 
     Raises:
@@ -171,6 +176,7 @@ class Concept(Shown):
     choice: Choice | None = None
     composing: tuple[Tensor, Tensor] | None = None
     quality: QualityRecord | None = None
+    reference: Reference | None = None
 
     def __post_init__(self) -> None:
         _expect_shapes(self._sets)
@@ -199,6 +205,8 @@ class Concept(Shown):
             yield f"{counted(len(self.modes), 'mode')}{', mixed' if self.modes.mixed else ''}"
         if self.adapter is not None:
             yield "an adapter"
+        if self.reference is not None:
+            yield self.reference.name
         yield f"loss {self.origin.loss:.3f}"
         yield f"weights {numbers(self.weights.tolist())}"
         yield f"from {counted(self.origin.count, 'demonstration')}"
@@ -211,7 +219,12 @@ class Concept(Shown):
         plain = Composition(self.embeddings, self.weights, modes=self.modes, space=space)
         if self.adapter is not None:
             plain = replace(plain, adapters=(self.adapter,), adapter=torch.ones(len(self.weights), dtype=torch.int64))
-        return plain if self.composing is None else Composition(*self.composing, alone=plain, space=space)
+        if self.reference is not None:
+            plain = replace(plain, made=self.reference)
+        composing = self.composing
+        if composing is None and self.reference is not None:
+            composing = self.embeddings, self.weights
+        return plain if composing is None else Composition(*composing, alone=plain, space=space)
 
     def component(self, number: int) -> Composition:
         """A single component; ``number`` counts from 1."""
@@ -257,7 +270,8 @@ class Concept(Shown):
     def numbers(self) -> dict[str, Tensor]:
         """Loss and all tensors by name."""
         factors = {} if self.adapter is None else self.adapter.tensors()
-        return {"loss": torch.tensor(float(self.origin.loss)), **self._sets, **factors}
+        made = {} if self.reference is None else self.reference.tensors()
+        return {"loss": torch.tensor(float(self.origin.loss)), **self._sets, **factors, **made}
 
     def save(self, path: str | Path) -> None:
         """Write a safetensors file with a JSON header.
@@ -281,6 +295,9 @@ class Concept(Shown):
             header |= {"everywhere": True}
         factors = {} if self.adapter is None else self.adapter.tensors()
         tensors = {**self._sets, **{f"{ADAPTER}{name}": factor for name, factor in factors.items()}}
+        if self.reference is not None:
+            header |= {"reference": self.reference.header}
+            tensors |= {f"{REFERENCE}{name}": values for name, values in self.reference.tensors().items()}
         save_tensors(path, KIND, {name: values.contiguous() for name, values in tensors.items()}, header, VERSION)
 
     @classmethod
@@ -302,7 +319,9 @@ class Concept(Shown):
             if missing:
                 raise UserError(f"expected the keys of a concept, found none of {', '.join(missing)}")
             factors = {name.removeprefix(ADAPTER): values for name, values in tensors.items() if name.startswith(ADAPTER)}
-            if unknown := set(tensors) - set(names) - {f"{ADAPTER}{name}" for name in factors}:
+            made = {name.removeprefix(REFERENCE): values for name, values in tensors.items() if name.startswith(REFERENCE)}
+            of_parts = {f"{ADAPTER}{name}" for name in factors} | {f"{REFERENCE}{name}" for name in made}
+            if unknown := set(tensors) - set(names) - of_parts:
                 raise UserError(f"expected the tensors {', '.join(names)}, found {short(', '.join(sorted(unknown)))} too")
             _expect_shapes({name: tensors[name] for name in names})
             everywhere = check_type(header.get("everywhere", False), bool, "everywhere")
@@ -315,7 +334,8 @@ class Concept(Shown):
             choice = from_mapping(Choice, header["choice"], "choice") if header.get("choice") else None
             composing = (tensors[COMPOSING[0]], tensors[COMPOSING[1]]) if composed else None
             quality = from_mapping(QualityRecord, header["quality"], "quality") if header.get("quality") is not None else None
-            concept = cls(tensors["embeddings"], tensors["weights"], origin, modes, adapter, choice, composing, quality)
+            reference = Reference.from_file(made, header.get("reference")) if made or "reference" in header else None
+            concept = cls(tensors["embeddings"], tensors["weights"], origin, modes, adapter, choice, composing, quality, reference)
             if header.get("components", len(concept.weights)) != len(concept.weights):
                 raise UserError(f"key 'components': expected {len(concept.weights)}, found {shown(header['components'])}")
             concept.check_finite("content")

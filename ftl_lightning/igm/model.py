@@ -29,9 +29,11 @@ class Invertible(Protocol):
 
     Attributes:
         training_embeddings: embeddings of the training concepts ``(training concept, n)``, centred: their mean is 0.
+        examples: demonstrations of training concepts, for a user's data; else ``None``.
     """
 
     training_embeddings: Tensor
+    examples: Demonstrations | None
 
     @property
     def device(self) -> torch.device:

@@ -222,6 +222,13 @@ class ConceptModel(Shown, nn.Module, ABC):
         """
         raise NotImplementedError(f"{type(self).__name__}: an invertible model defines losses")
 
+    def products(self, states: Tensor, observed: Observed, draws: Draws | None, loss: str) -> Tensor | None:
+        """Inner products of the branches of all training concepts; ``None`` for a model without a composed denoiser.
+
+        See :meth:`ftl_lightning.igm.model.DiffusionModel.branch_products`.
+        """
+        return None
+
     @property
     def text_space(self) -> bool:
         """Whether the concept space is the text encoder's."""

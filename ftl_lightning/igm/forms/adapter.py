@@ -107,16 +107,16 @@ def adapted(denoiser: Denoiser, adapters: Sequence[Any], number: Tensor) -> Deno
 
     Adapters of layers for each sample take a single forward pass together, others a pass for each adapter.
     """
-    low_rank = all(isinstance(adapter, LowRank) for adapter in adapters) and isinstance(denoiser, nn.Module)
-    if low_rank and len({frozenset(adapter.factors) for adapter in adapters}) == 1:
-        names = set(adapters[0].factors)
-        if names <= _by_sample(denoiser):
+    low_rank = [adapter for adapter in adapters if isinstance(adapter, LowRank)]
+    alike = len(low_rank) == len(adapters) and len({frozenset(adapter.factors) for adapter in low_rank}) == 1
+    if isinstance(denoiser, nn.Module) and alike and set(low_rank[0].factors) <= _by_sample(denoiser):
+        network = denoiser
 
-            def together(x: Tensor, t: Tensor, concepts: Tensor, index: Tensor, context: Context) -> Tensor:
-                with _hooked(denoiser, adapters, number):
-                    return denoiser(x, t, concepts, index, context)
+        def together(x: Tensor, t: Tensor, concepts: Tensor, index: Tensor, context: Context) -> Tensor:
+            with _hooked(network, low_rank, number):
+                return denoiser(x, t, concepts, index, context)
 
-            return together
+        return together
     return lambda *inputs: _one_by_one(denoiser, adapters, number, *inputs)
 
 

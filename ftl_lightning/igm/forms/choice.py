@@ -1,21 +1,34 @@
 """Forms of learned concepts, and selection of a form by leave-one-out error."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from ftl_lightning.data.demonstrations import Demonstrations
+import torch
+from torch import Tensor
+
+from ftl_lightning.data.demonstrations import Demonstrations, concatenate
+from ftl_lightning.data.references import Reference, Setting
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import Choice, Concept
+from ftl_lightning.igm.forms.combination import Combination
 from ftl_lightning.igm.forms.leave_one_out import learned_from, quickly, relative_losses
 from ftl_lightning.igm.forms.modes import Modes, even_stretch
 from ftl_lightning.igm.forms.quality import Quality, measured
+from ftl_lightning.igm.forms.skill import LeftOut
 from ftl_lightning.igm.inversion import Inversion, Tell, Watch, invert
 from ftl_lightning.igm.model import Invertible
-from ftl_lightning.igm.settings import ADAPTED, AUTO, MIXED, MODES, ONE, PAPER, UNSAID, InversionSettings
+from ftl_lightning.igm.settings import ADAPTED, AUTO, COMBINED, MIXED, MODES, NOT_LEARNED, ONE, PAPER, UNSAID, InversionSettings
+from ftl_lightning.services.errors import UserError
 
 RANK, RATE, ADAPTER_STEPS = 1, 3e-3, 120
 """Default rank, learning rate and steps of adapters."""
+SKILLED: Mapping[str, Any] = {"adapter": 8, "adapter_learning_rate": 6e-3, "components": 1, "omega": 1.0}
+SKILLED_STEPS = 200
+"""Settings of the adapter that :func:`by_skill` learns, and steps of the adapter and of modes."""
+KNOWN = "best training concept"
+SIMPLEST = (COMBINED, ONE, ADAPTED, MODES)
+"""Learned forms of :func:`by_skill`, the simplest first."""
 MODE_SAMPLES, MODE_STEPS = 16, 400
 """Noised demonstrations a step, and maximum number of steps, of modes without an adapter."""
 FOLDS, CLEAR, FEWER = 5, 0.4, 2
@@ -61,6 +74,13 @@ def learn(
         return _with_modes(model, demonstrations, settings, steps, first, tell)
     if settings.form in (ADAPTED, MIXED):
         return _adapted(model, demonstrations, settings, steps, settings.form == MIXED, tell)
+    if settings.form == COMBINED:
+        combinations = {name: Combination.of(model, demonstrations.select(name), settings) for name in first}
+        return {name: _combined(model, combinations[name], concept) for name, concept in first.items()}
+    if settings.form in NOT_LEARNED:
+        return {name: _made(model, demonstrations.select(name), settings.form, concept) for name, concept in first.items()}
+    if model.examples is not None:
+        return {name: by_skill(model, demonstrations.select(name), settings, steps, first[name], tell) for name in first}
     return _chosen(model, demonstrations, settings, steps, first, tell)
 
 
@@ -91,18 +111,119 @@ def _with_modes(
 
 
 def _adapted(
-    model: Invertible, demonstrations: Demonstrations, settings: InversionSettings, steps: int, mixed: bool, tell: Tell
+    model: Invertible,
+    demonstrations: Demonstrations,
+    settings: InversionSettings,
+    steps: int,
+    mixed: bool,
+    tell: Tell,
+    most: int = ADAPTER_STEPS,
 ) -> dict[str, Concept]:
     """Concepts of one set and an adapter; with ``mixed``, of mixtures that share an adapter (several demonstrations only)."""
     adapter = settings.adapter
     rank, rate = (adapter.rank, adapter.learning_rate) if adapter.rank else (RANK, RATE)
     changes = {"modes": "each" if mixed else 1, "adapter": rank, "adapter_learning_rate": rate, "tolerance": None}
-    concepts = invert(model, demonstrations, settings.from_one_start(form=PAPER, **changes), min(steps, ADAPTER_STEPS), tell)
+    concepts = invert(model, demonstrations, settings.from_one_start(form=PAPER, **changes), min(steps, most), tell)
     for name, concept in concepts.items():
         if concept.modes:
             modes = replace(concept.modes, mixed=True, stretch=even_stretch(len(concept.modes)))
             concepts[name] = replace(concept, modes=modes)
     return concepts
+
+
+def combined(model: Invertible, weights: Tensor) -> Composition:
+    """Composition ``(K, ...)`` of the training concepts with weights ``(training concept,)`` other than 0; at least one of them."""
+    used = weights.nonzero()[:, 0] if weights.any() else torch.zeros(1, dtype=torch.int64)
+    return Composition(model.training_embeddings.cpu()[used][:, None].clone(), weights[used].clone())
+
+
+def _combined(model: Invertible, combination: Combination | None, first: Concept) -> Concept:
+    """Concept of weights of training concepts; ``UserError`` for a model without a composed denoiser."""
+    if combination is None:
+        raise UserError("model.form: expected a diffusion model for a combination of training concepts, found another method")
+    composition = combined(model, combination.weights)
+    origin = replace(first.origin, weights="learned", loss=combination.loss)
+    return Concept(composition.embeddings, composition.weights, origin)
+
+
+def _made(model: Invertible, demonstrations: Demonstrations, form: str, first: Concept) -> Concept:
+    """Concept that samples a reference of its demonstrations; ``first`` is composed."""
+    setting = Setting.of(demonstrations if model.examples is None else model.examples, model.horizon)
+    return replace(first, reference=Reference.of(form, demonstrations, setting, model.horizon))
+
+
+def by_skill(
+    model: Invertible, demonstrations: Demonstrations, settings: InversionSettings, steps: int, first: Concept, tell: Tell
+) -> Concept:
+    """The concept in the form with the highest skill, see :class:`~ftl_lightning.igm.forms.skill.LeftOut`.
+
+    The simplest learned form whose skill is within one standard error of the best is taken. If a shifted or a warped demonstration,
+    which needs no learning, has a higher skill, that reference is the form.
+
+    Args:
+        demonstrations: demonstrations of one concept.
+        first: the concept as one set.
+    """
+    assert model.examples is not None
+    if len(demonstrations) < 2:
+        return replace(first, choice=Choice(ONE, "there is a single demonstration", {}))
+    left, seed = LeftOut(model, demonstrations, model.examples), settings.seed
+    whole, skills = {ONE: first}, dict[str, Tensor]()
+    combination = Combination.of(model, demonstrations, settings)
+    if combination is not None:
+        assert combination.folds is not None
+        whole[COMBINED] = _combined(model, combination, first)
+        skills[COMBINED] = left.skill([combined(model, combination.folds[row]) for row in left.rows], seed)
+        alone = torch.zeros_like(combination.weights)
+        alone[combination.best] = 1
+        skills[KNOWN] = left.skill([combined(model, alone)] * len(left.rows), seed)
+    parts = left.parts()
+    sets = learned_from(model, demonstrations, _rows_of(len(demonstrations), left.rows), quickly(settings), steps, tell)
+    skills[ONE] = left.skill([sets.row(fold) for fold in range(len(parts))], seed)
+    labelled = concatenate([replace(part, concepts=(f"{fold}",) * len(part)) for fold, part in enumerate([demonstrations, *parts])])
+    adapted, *without = _adapted(model, labelled, settings.changed(**SKILLED), steps, False, tell, SKILLED_STEPS).values()
+    whole[ADAPTED] = replace(adapted, origin=replace(first.origin, loss=adapted.origin.loss))
+    skills[ADAPTED] = left.skill([concept.composition for concept in without], seed)
+    if len(demonstrations) > 2:
+        few, name = min(steps, SKILLED_STEPS), first.origin.name
+        whole[MODES] = _with_modes(model, demonstrations, settings, few, {name: first}, tell)[name]
+        modes = whole[MODES].modes
+        assert modes is not None
+        rest = [[row for row in range(len(demonstrations)) if row != out] for out in left.rows]
+        kept = [replace(modes, embeddings=modes.embeddings[rows], weights=modes.weights[rows]) for rows in rest]
+        skills[MODES] = left.skill([replace(first, modes=each).composition for each in kept], seed)
+    references = left.references(first.composition.uncomposed, seed)
+    form, because = _by_skill({name: skills[name] for name in SIMPLEST if name in whole}, references)
+    chosen = _made(model, demonstrations, form, first) if form in references else whole[form]
+    numbers = {f"skill, {name}": round(float(value.mean()), 4) for name, value in (skills | references).items()}
+    composing = None if COMBINED not in whole or form == COMBINED else (whole[COMBINED].embeddings, whole[COMBINED].weights)
+    keep = composing is not None and float(skills[COMBINED].mean()) >= float(skills[ONE].mean())
+    return replace(chosen, choice=Choice(form, because, numbers), composing=composing if keep else None)
+
+
+def _rows_of(count: int, left: Sequence[int]) -> list[list[int]]:
+    return [[row for row in range(count) if row != out] for out in left]
+
+
+def _by_skill(learned: Mapping[str, Tensor], references: Mapping[str, Tensor]) -> tuple[str, str]:
+    """The form and its reason, by the skill ``(fold,)`` of learned forms, the simplest first, and of references."""
+    best = max(learned, key=lambda name: float(learned[name].mean()))
+    form = next(name for name, skill in learned.items() if _within(skill, learned[best]))
+    offered = {name: skill for name, skill in references.items() if name in NOT_LEARNED}
+    rival = max(references, key=lambda name: float(references[name].mean()))
+    other = max(offered, key=lambda name: float(offered[name].mean()))
+    said = f"skill {float(learned[form].mean()):.2f} on left-out demonstrations"
+    if float(offered[other].mean()) > float(learned[form].mean()):
+        return other, f"no learned form is as good: {form} has {said}, the {other} {float(offered[other].mean()):.2f}"
+    if float(references[rival].mean()) > float(learned[form].mean()):
+        return form, f"{said}; the {rival} has {float(references[rival].mean()):.2f} without learning"
+    return form, f"{said}; the best reference, the {rival}, has {float(references[rival].mean()):.2f}"
+
+
+def _within(skill: Tensor, best: Tensor) -> bool:
+    """Whether a skill ``(fold,)`` is within one standard error of a better one; the error is of the differences."""
+    apart = best - skill
+    return float(apart.mean()) <= float(apart.std(correction=1) / len(apart) ** 0.5)
 
 
 @dataclass(frozen=True)

@@ -32,15 +32,19 @@ class Combination:
 
     Attributes:
         weights: ``(training concept,)`` float32 on the CPU; most are 0.
-        own: loss of the demonstrations relative to their unconditional loss.
+        loss: loss of the demonstrations (Eq. 2).
+        own: the same, relative to their unconditional loss.
         left_out: the same of each demonstration ``(demo,)`` under weights learned from the others; ``None`` for a single one.
         folds: weights learned without each demonstration ``(demo, training concept)``; ``None`` for a single one.
+        best: index of the training concept that explains the demonstrations best alone.
     """
 
     weights: Tensor
+    loss: float
     own: float
     left_out: Tensor | None
     folds: Tensor | None
+    best: int
 
     @classmethod
     @torch.no_grad()
@@ -68,10 +72,13 @@ class Combination:
                 return None
             products.append(part.double().mean(dim=0).cpu())
         every = torch.stack(products)  # (demo, 1 + N, 1 + N)
+        total = every.sum(dim=0)
+        best = int((total.diagonal()[1:] - 2 * total[0, 1:]).argmin())
         if len(every) == 1:
             weights = _minimum(every, PENALTIES[1])
-            return cls(weights[0].float(), float(_losses(every, weights) / every[0, 0, 0]), None, None)
-        others = (every.sum(dim=0) - every) / (len(every) - 1)
+            loss = float(_losses(every, weights))
+            return cls(weights[0].float(), loss, loss / float(every[0, 0, 0]), None, None, best)
+        others = (total - every) / (len(every) - 1)
         empty = every[:, 0, 0]
         curve, folds = [], []
         for penalty in PENALTIES:
@@ -79,12 +86,12 @@ class Combination:
             curve.append(_losses(every, folds[-1]) / empty)
         left_out = torch.stack(curve)  # (penalty, demo)
         mean = left_out.mean(dim=1)
-        best = int(mean.argmin())
-        error = (left_out - left_out[best]).std(dim=1) / len(every) ** 0.5  # of differences: the demonstrations are the same
-        chosen = int((mean - mean[best] <= error).nonzero()[0])
-        weights = _minimum(every.mean(dim=0, keepdim=True), PENALTIES[chosen])
-        own = float(_losses(every, weights.expand(len(every), -1)).sum() / empty.sum())
-        return cls(weights[0].float(), own, left_out[chosen].float(), folds[chosen].float())
+        lowest = int(mean.argmin())
+        error = (left_out - left_out[lowest]).std(dim=1) / len(every) ** 0.5  # of differences: the demonstrations are the same
+        chosen = int((mean - mean[lowest] <= error).nonzero()[0])
+        weights = _minimum(total[None] / len(every), PENALTIES[chosen])
+        loss = float(_losses(every, weights.expand(len(every), -1)).mean())
+        return cls(weights[0].float(), loss, loss / float(empty.mean()), left_out[chosen].float(), folds[chosen].float(), best)
 
 
 def _minimum(products: Tensor, penalty: float) -> Tensor:

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor, nn
 
 from ftl_lightning import networks
-from ftl_lightning.data.features import Observed
+from ftl_lightning.data.features import Observed, take
 from ftl_lightning.data.pinned import Pinned
-from ftl_lightning.igm.composition import Composition
+from ftl_lightning.igm.composition import Composition, Maker
 from ftl_lightning.igm.diffusion import MOST_STEPS, PREDICTIONS, Context, Prediction, cosine_alpha_bar
 from ftl_lightning.igm.forms.adapter import LowRank, adaptable
 from ftl_lightning.igm.model import DiffusionModel, Draws
@@ -124,13 +124,33 @@ class GenerativeModel(DiffusionModel, TextConceptModel):
         generators: Sequence[torch.Generator],
         observed: Observed | None = None,
     ) -> Tensor:
-        features = observed or {}
+        features, shape = observed or {}, (len(compositions), count)
         known, pinned = self.known_states(features), None
         if known is not None:
             values = self.encode(known, features)  # NaN where a number depends on an unknown state
             pinned = Pinned(~values.isnan(), values.nan_to_num())
-        plans = self.composed_plans(compositions, count, sampling, generators, self.observe(features), pinned)
-        states = self.decode(plans, features)
+        makers = [composition.uncomposed.made for composition in compositions]
+        if all(makers):
+            states = self._made(makers, count, generators, features)
+            states = states if pinned is None else self.decode(pinned(self.encode(states, features)), features)
+        elif any(makers):
+            parts = zip(compositions, generators, torch.arange(len(compositions) * count).split(count), strict=True)
+            each = [self.sample([part], count, sampling, [draw], take(features, rows)) for part, draw, rows in parts]
+            return torch.cat(each)
+        else:
+            plans = self.composed_plans(compositions, count, sampling, generators, self.observe(features), pinned)
+            states = self.decode(plans, features)
         if known is not None:
             states = torch.where(known.isnan(), states, known)
-        return states.unflatten(0, (len(compositions), count))
+        return states.unflatten(0, shape)
+
+    def _made(
+        self, makers: Sequence[Maker | None], count: int, generators: Sequence[torch.Generator], features: Observed
+    ) -> Tensor:
+        """Samples ``(composition * count, horizon, state)`` of makers, as the columns' kinds allow."""
+        parts = []
+        for number, (maker, draw) in enumerate(zip(makers, generators, strict=True)):
+            assert maker is not None
+            parts.append(maker.sample(take(features, slice(number * count, (number + 1) * count)), count, draw))
+        states = torch.cat(parts).to(self.device)
+        return states if self.view is None else self.decode(self.encode(states, features), features)
