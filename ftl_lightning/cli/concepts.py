@@ -105,6 +105,7 @@ def explain(concept: str, pretrained: str = "", nearest: int = 3) -> None:
     """
     from ftl_lightning.igm.concept import Concept
     from ftl_lightning.igm.explanation import explain as explained
+    from ftl_lightning.igm.explanation import formula
     from ftl_lightning.services.shipped import MODELS
     from ftl_lightning.training.checks import check_concept
     from ftl_lightning.training.model_folder import find_model, load_model
@@ -115,6 +116,12 @@ def explain(concept: str, pretrained: str = "", nearest: int = 3) -> None:
     check_concept(model, learned, concept)
     names = model.config.training_concepts
     say(f"{learned.origin.name}: learned from {learned.origin.count} demonstrations of {learned.origin.domain}")
+    alone, training = (learned.embeddings, learned.weights), model.training_embeddings
+    combination = formula(*alone, names, training)
+    if learned.composing is not None or combination:
+        say(f"combination of training concepts: {combination or formula(*(learned.composing or alone), names, training)}")
+    if learned.reference is not None:
+        say(f"alone it generates from a {learned.reference.name}, without the model; composed, from the components")
     if learned.modes is not None:
         how = "a random mixture of them" if learned.modes.mixed else "one of them"
         composed = "composed too" if learned.knots > 1 else "composed, from the components that have no mode"
@@ -123,6 +130,8 @@ def explain(concept: str, pretrained: str = "", nearest: int = 3) -> None:
         say(f"form: {learned.choice}")
     if learned.composing is not None:
         say("composed it is another set of embeddings, in the span of the training concepts")
+    if combination:
+        return
     parts = [(f"{name}, weight {part.weight:.2f}", part.embedding) for name, part in learned.parts().items()]
     if len(learned.weights) > 1:
         whole = learned.at_knots(learned.weighted_sum)

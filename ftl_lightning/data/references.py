@@ -117,6 +117,13 @@ class Reference:
             chosen = rest[index]
         return self._started(chosen + frames.shift(seen, width), seen)
 
+    def each(self, observed: Observed) -> Tensor:
+        """Every demonstration ``(demo, horizon, state)`` moved to places ``(demo, ...)``."""
+        seen = {key: observed[key].flatten(1).float().cpu() for key in self.observed}
+        frames = Frames.fit(self.paths, self.observed, self.setting.places)
+        width = self.paths.shape[2]
+        return self._started(self.paths - frames.shift(self.observed, width) + frames.shift(seen, width), seen)
+
     def _nearest(self, observed: Observed, count: int) -> Tensor:
         """Index of the demonstration of each sample ``(count,)``."""
         if not observed:

@@ -209,3 +209,23 @@ def _by_name(observed: Any, features: Mapping[str, Feature]) -> dict[str, Any]:
     if len(features) != 1:
         raise UserError(f"observed: expected features by name ({', '.join(features) or 'none'}), found values without one")
     return {next(iter(features)): observed}
+
+
+def pinned_states(pin: Mapping[int, ArrayLike], count: int, horizon: int, columns: Sequence[str]) -> Tensor:
+    """Known states ``(count, horizon, state)`` by time, NaN elsewhere; ``UserError`` for a time or shape that does not fit.
+
+    Args:
+        pin: states ``(state,)`` or ``(count, state)`` by time, negative from the end.
+        columns: names of the columns of a state.
+    """
+    known = torch.full((count, horizon, len(columns)), torch.nan)
+    for time, state in pin.items():
+        whole = isinstance(time, int | np.integer) and not isinstance(time, bool) and -horizon <= time < horizon
+        require(whole, "pin", f"times from {-horizon} to {horizon - 1}", shown(time))
+        values = torch.as_tensor(np.array(state, dtype=np.float32))
+        fits = values.shape in ((len(columns),), (count, len(columns)))
+        wanted = f"a state of {len(columns)} columns, or {count} of them"
+        require(fits, f"pin, time {time}", wanted, f"an array of shape {tuple(values.shape)}")
+        require(not values.isinf().any(), f"pin, time {time}", "finite numbers, NaN for a free column", "infinity")
+        known[:, int(time)] = values
+    return known

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from ftl_lightning.data.check import axes
 from ftl_lightning.data.demonstrations import Demonstrations
-from ftl_lightning.data.features import InitialStates, moved
+from ftl_lightning.data.features import PINNED, InitialStates, moved
 from ftl_lightning.domains.domain import Domain, closed_loop_of
 from ftl_lightning.evaluation.closed_loop import reset
 from ftl_lightning.evaluation.execution import Execution, episodes
@@ -25,6 +25,7 @@ from ftl_lightning.few_shot.arrays import (
     demonstrations_of,
     mended_states,
     of_one_concept,
+    pinned_states,
     scenes_of,
     starts_of,
 )
@@ -60,7 +61,7 @@ if TYPE_CHECKING:
 PLANS = 10
 """Default number of sampled plans."""
 GIVEN = {
-    "sample": ("count", "observed", "seed", "batch_size", "progress"),
+    "sample": ("count", "observed", "seed", "pin", "batch_size", "progress"),
     "execute": ("scenes", "goal", "replan", "environment", "seed"),
 }
 """Arguments besides the sampler's settings."""
@@ -441,6 +442,7 @@ class FewShot(Shown):
         observed: Start | None = None,
         *,
         seed: int = 0,
+        pin: Mapping[int, ArrayLike] | None = None,
         batch_size: int | None = None,
         progress: bool = False,
         **changes: Any,
@@ -452,6 +454,9 @@ class FewShot(Shown):
             count: number of plans; ``None`` for a plan for each initial state, or 10 plans without initial states.
             observed: initial states, in domains with observed features.
             seed: seed of the noise.
+            pin: states that plans have to pass, by time, negative from the end: ``{0: start, -1: end}``; each ``(state,)`` or
+                ``(count, state)`` in the domain's units, NaN for a free column. In a user's data, observed features that equal the
+                initial state are pinned without it.
             batch_size: maximum number of plans in a batch, to save memory; ``None`` for all. Plans are equal up to rounding.
             progress: show a bar.
             changes: options of :class:`~ftl_lightning.igm.samplers.Sampling`: ``sampler``, ``steps``, ``temperature``.
@@ -469,6 +474,9 @@ class FewShot(Shown):
         require(starts is None or count == wanted, "count", f"{wanted} (a plan for each of the starts), or none", count)
         size = None if batch_size is None else check_whole("batch_size", batch_size, 1)
         seen = {} if starts is None else moved(starts.observed, self.device)
+        if pin:
+            require(self.model.invertible and self.model.max_steps is not None, "pin", "a diffusion model", self.model.method.name)
+            seen = {**seen, PINNED: pinned_states(pin, count, self.model.horizon, self.domain.plans.columns).to(self.device)}
         states = sampled(self.model, concept, count, sampling, seed, seen, size, progress).cpu()
         provenance = {"pretrained": self.model.hash, "seed": seed, "temperature": sampling.temperature}
         return plans_of(self.domain, states, starts, provenance)

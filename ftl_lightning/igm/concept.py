@@ -9,7 +9,7 @@ from typing import NamedTuple, Self
 import torch
 from torch import Tensor
 
-from ftl_lightning.data.references import Reference
+from ftl_lightning.data.references import NAMES, Reference
 from ftl_lightning.igm.composition import Composition, space_of
 from ftl_lightning.igm.forms.adapter import LowRank
 from ftl_lightning.igm.forms.modes import STRETCH, Modes
@@ -20,6 +20,8 @@ from ftl_lightning.services.text import Shown, counted, numbers
 from ftl_lightning.services.validation import LARGEST_FACTOR, check_factor, check_range, check_type, from_mapping
 
 KIND = "concept"
+SKILL, KNOWN = "skill, ", "best training concept"
+"""Prefix of the skill of forms and references in :attr:`Choice.numbers`, and the reference of a training concept."""
 VERSION = 5
 """Version of the file format."""
 MODES = ("mode_embeddings", "mode_weights")
@@ -115,6 +117,21 @@ class Choice:
 
     def __str__(self) -> str:
         return f"{self.form}: {self.because}"
+
+    @property
+    def skills(self) -> Mapping[str, float]:
+        """Skill of forms and references on left-out demonstrations, see :class:`~ftl_lightning.igm.forms.skill.LeftOut`."""
+        return {name.removeprefix(SKILL): value for name, value in self.numbers.items() if name.startswith(SKILL)}
+
+    @property
+    def words(self) -> str:
+        """Skill of the form beside the references that need no learning; empty if it was not measured."""
+        skills = self.skills
+        if self.form not in skills:
+            return ""
+        others = sorted(((skills[name], name) for name in (*NAMES, KNOWN) if name in skills and name != self.form), reverse=True)
+        beside = ", ".join(f"{name} {value:.2f}" for value, name in others)
+        return f"{self.form} has skill {skills[self.form]:.2f} on left-out demonstrations (without learning: {beside})"
 
 
 @dataclass(frozen=True)

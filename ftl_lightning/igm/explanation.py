@@ -48,6 +48,21 @@ class Explanation:
         )
 
 
+def formula(embeddings: Tensor, weights: Tensor, names: Sequence[str], training: Tensor) -> str:
+    """Weighted sum of training concepts, such as ``'0.53 red + 0.55 blue'``; empty if an embedding is not a training concept's.
+
+    Args:
+        embeddings, weights: of a concept, ``(K, knots, n)`` and ``(K,)``.
+        names, training: training concepts and their embeddings ``(training concept, n)``.
+    """
+    apart = (embeddings[:, :1] - training).abs().amax(dim=2)
+    if embeddings.shape[1] != 1 or not bool((apart.amin(dim=1) == 0).all()):
+        return ""
+    terms = sorted(zip(weights.tolist(), apart.argmin(dim=1).tolist(), strict=True), key=lambda term: -abs(term[0]))
+    text = "".join(f" {'-' if weight < 0 else '+'} {abs(weight):.2f} {names[row]}" for weight, row in terms)
+    return text.removeprefix(" + ").removeprefix(" ")
+
+
 def explain(embedding: Tensor, names: Sequence[str], training: Tensor, nearest: int = 3) -> Explanation:
     """Explain an embedding by training concepts.
 

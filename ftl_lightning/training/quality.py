@@ -75,6 +75,7 @@ class Inspection:
         starts: initial state of each sample.
         domain: domain that draws the pictures.
         name: name of the concept.
+        skill: skill of the form beside references; empty if it was not measured.
     """
 
     quality: Quality
@@ -84,10 +85,12 @@ class Inspection:
     starts: InitialStates
     domain: Domain
     name: str
+    skill: str = ""
 
     def __str__(self) -> str:
         metric = "" if self.right is None else f"{self.right[0]} {self.right[1]:.2f}, "
-        return f"{metric}{self.quality.words} ({len(self.samples)} samples)"
+        skill = f"{self.skill}; " if self.skill else ""
+        return f"{skill}{metric}{self.quality.words} ({len(self.samples)} samples)"
 
     @property
     def record(self) -> QualityRecord:
@@ -126,4 +129,5 @@ def inspected(model: ConceptModel, domain: Domain, demonstrations: Demonstration
     observed = observed_from(demonstrations)
     quality = Quality.of(encoded(model, plans, starts), encoded(model, known, first), observed)
     success = None if right is None else (right[0], float(right[1].float().mean()))
-    return Inspection(quality, success, known, plans, starts, domain, name)
+    skill = "" if concept.choice is None else concept.choice.words
+    return Inspection(quality, success, known, plans, starts, domain, name, skill)

@@ -10,7 +10,7 @@ from torch import Tensor
 from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.data.references import Reference, Setting
 from ftl_lightning.igm.composition import Composition
-from ftl_lightning.igm.concept import Choice, Concept
+from ftl_lightning.igm.concept import KNOWN, SKILL, Choice, Concept
 from ftl_lightning.igm.forms.combination import Combination
 from ftl_lightning.igm.forms.leave_one_out import learned_from, quickly, relative_losses
 from ftl_lightning.igm.forms.modes import Modes, even_stretch
@@ -26,7 +26,6 @@ RANK, RATE, ADAPTER_STEPS = 1, 3e-3, 120
 SKILLED: Mapping[str, Any] = {"adapter": 8, "adapter_learning_rate": 6e-3, "components": 1, "omega": 1.0}
 SKILLED_STEPS = 200
 """Settings of the adapter that :func:`by_skill` learns, and steps of the adapter and of modes."""
-KNOWN = "best training concept"
 SIMPLEST = (COMBINED, ONE, ADAPTED, MODES)
 """Learned forms of :func:`by_skill`, the simplest first."""
 MODE_SAMPLES, MODE_STEPS = 16, 400
@@ -168,22 +167,22 @@ def by_skill(
     if len(demonstrations) < 2:
         return replace(first, choice=Choice(ONE, "there is a single demonstration", {}))
     left, seed = LeftOut(model, demonstrations, model.examples), settings.seed
-    whole, skills = {ONE: first}, dict[str, Tensor]()
+    whole, scores = {ONE: first}, dict[str, Tensor]()
     combination = Combination.of(model, demonstrations, settings)
     if combination is not None:
         assert combination.folds is not None
         whole[COMBINED] = _combined(model, combination, first)
-        skills[COMBINED] = left.skill([combined(model, combination.folds[row]) for row in left.rows], seed)
+        scores[COMBINED] = left.score([combined(model, combination.folds[row]) for row in left.rows], seed)
         alone = torch.zeros_like(combination.weights)
         alone[combination.best] = 1
-        skills[KNOWN] = left.skill([combined(model, alone)] * len(left.rows), seed)
+        scores[KNOWN] = left.score([combined(model, alone)] * len(left.rows), seed)
     parts = left.parts()
     sets = learned_from(model, demonstrations, _rows_of(len(demonstrations), left.rows), quickly(settings), steps, tell)
-    skills[ONE] = left.skill([sets.row(fold) for fold in range(len(parts))], seed)
+    scores[ONE] = left.score([sets.row(fold) for fold in range(len(parts))], seed)
     labelled = concatenate([replace(part, concepts=(f"{fold}",) * len(part)) for fold, part in enumerate([demonstrations, *parts])])
     adapted, *without = _adapted(model, labelled, settings.changed(**SKILLED), steps, False, tell, SKILLED_STEPS).values()
     whole[ADAPTED] = replace(adapted, origin=replace(first.origin, loss=adapted.origin.loss))
-    skills[ADAPTED] = left.skill([concept.composition for concept in without], seed)
+    scores[ADAPTED] = left.score([concept.composition for concept in without], seed)
     if len(demonstrations) > 2:
         few, name = min(steps, SKILLED_STEPS), first.origin.name
         whole[MODES] = _with_modes(model, demonstrations, settings, few, {name: first}, tell)[name]
@@ -191,13 +190,14 @@ def by_skill(
         assert modes is not None
         rest = [[row for row in range(len(demonstrations)) if row != out] for out in left.rows]
         kept = [replace(modes, embeddings=modes.embeddings[rows], weights=modes.weights[rows]) for rows in rest]
-        skills[MODES] = left.skill([replace(first, modes=each).composition for each in kept], seed)
+        scores[MODES] = left.score([replace(first, modes=each).composition for each in kept], seed)
     references = left.references(first.composition.uncomposed, seed)
-    form, because = _by_skill({name: skills[name] for name in SIMPLEST if name in whole}, references)
+    every = scores | references
+    form, because = _by_skill({name: scores[name] for name in SIMPLEST if name in whole}, references, left)
     chosen = _made(model, demonstrations, form, first) if form in references else whole[form]
-    numbers = {f"skill, {name}": round(float(value.mean()), 4) for name, value in (skills | references).items()}
+    numbers = {f"{SKILL}{name}": round(left.skill(value.mean()), 4) for name, value in every.items()}
     composing = None if COMBINED not in whole or form == COMBINED else (whole[COMBINED].embeddings, whole[COMBINED].weights)
-    keep = composing is not None and float(skills[COMBINED].mean()) >= float(skills[ONE].mean())
+    keep = composing is not None and float(scores[COMBINED].mean()) <= float(scores[ONE].mean())
     return replace(chosen, choice=Choice(form, because, numbers), composing=composing if keep else None)
 
 
@@ -205,24 +205,24 @@ def _rows_of(count: int, left: Sequence[int]) -> list[list[int]]:
     return [[row for row in range(count) if row != out] for out in left]
 
 
-def _by_skill(learned: Mapping[str, Tensor], references: Mapping[str, Tensor]) -> tuple[str, str]:
-    """The form and its reason, by the skill ``(fold,)`` of learned forms, the simplest first, and of references."""
-    best = max(learned, key=lambda name: float(learned[name].mean()))
-    form = next(name for name, skill in learned.items() if _within(skill, learned[best]))
-    offered = {name: skill for name, skill in references.items() if name in NOT_LEARNED}
-    rival = max(references, key=lambda name: float(references[name].mean()))
-    other = max(offered, key=lambda name: float(offered[name].mean()))
-    said = f"skill {float(learned[form].mean()):.2f} on left-out demonstrations"
-    if float(offered[other].mean()) > float(learned[form].mean()):
-        return other, f"no learned form is as good: {form} has {said}, the {other} {float(offered[other].mean()):.2f}"
-    if float(references[rival].mean()) > float(learned[form].mean()):
-        return form, f"{said}; the {rival} has {float(references[rival].mean()):.2f} without learning"
-    return form, f"{said}; the best reference, the {rival}, has {float(references[rival].mean()):.2f}"
+def _by_skill(learned: Mapping[str, Tensor], references: Mapping[str, Tensor], left: LeftOut) -> tuple[str, str]:
+    """Form and reason, by the scores ``(fold,)`` of learned forms, the simplest first, and of references; the lowest is best."""
+    means = {name: float(score.mean()) for name, score in {**learned, **references}.items()}
+    best = min(learned, key=lambda name: means[name])
+    form = next(name for name, score in learned.items() if _within(score, learned[best]))
+    rival, other = min(references, key=lambda name: means[name]), min(NOT_LEARNED, key=lambda name: means[name])
+    skill = {name: f"{left.skill(mean):.2f}" for name, mean in means.items()}
+    if means[other] < means[form]:
+        return other, f"no learned form is as good on left-out demonstrations: {form} has skill {skill[form]}, this {skill[other]}"
+    said = f"skill {skill[form]} on left-out demonstrations"
+    if means[rival] < means[form]:
+        return form, f"{said}; the {rival} has {skill[rival]} without learning"
+    return form, f"{said}; the best reference, the {rival}, has {skill[rival]}"
 
 
-def _within(skill: Tensor, best: Tensor) -> bool:
-    """Whether a skill ``(fold,)`` is within one standard error of a better one; the error is of the differences."""
-    apart = best - skill
+def _within(score: Tensor, best: Tensor) -> bool:
+    """Whether a score ``(fold,)`` is within one standard error of a better one; the error is of the differences."""
+    apart = score - best
     return float(apart.mean()) <= float(apart.std(correction=1) / len(apart) ** 0.5)
 
 

@@ -10,7 +10,7 @@ from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.energy import PathFeatures, ceiling
 from ftl_lightning.data.features import InitialStates, moved
 from ftl_lightning.data.places import first_windows
-from ftl_lightning.data.references import NAMES, Reference, Setting
+from ftl_lightning.data.references import NAMES, SHIFTED, Reference, Setting
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.model import Invertible
 from ftl_lightning.igm.samplers import Sampling
@@ -18,6 +18,8 @@ from ftl_lightning.services.randomness import generator
 
 FOLDS, SAMPLES = 5, 16
 """Maximum number of left-out demonstrations, and samples for each."""
+LEAST = 0.05
+"""Score that is added to both in the ratio of a skill: behaviour that hardly varies is not judged by its rounding."""
 SAMPLING = Sampling("dpm_solver", 10, 1.0)
 """Sampling of candidates."""
 
@@ -25,9 +27,9 @@ SAMPLING = Sampling("dpm_solver", 10, 1.0)
 class LeftOut:
     """Scores of candidates on left-out demonstrations of one concept, in the network's normalised columns.
 
-    The skill of samples is 0 for behaviour of all training concepts at random, and 1 for fresh demonstrations where nothing is
-    observed; where something is observed, 1 is exact. It is a mean over the features of
-    :class:`~ftl_lightning.data.energy.PathFeatures`, and may be below 0.
+    A score is the mean of the energy scores of all features of :class:`~ftl_lightning.data.energy.PathFeatures`, each relative to
+    that of behaviour of all training concepts at random. The skill of samples is the score of fresh demonstrations divided by that
+    of the samples: 1 for fresh demonstrations, 0.5 for twice their score.
 
     Args:
         model: frozen model.
@@ -36,6 +38,8 @@ class LeftOut:
 
     Attributes:
         rows: left-out demonstrations ``(fold,)``.
+        fresh: score of fresh demonstrations, from the distances among the demonstrations; where places are observed, from those
+            among the demonstrations moved to the places of each.
         setting: what the training concepts say about behaviour, for references.
     """
 
@@ -48,30 +52,44 @@ class LeftOut:
         known = self._encoded(first_windows(demonstrations, model.horizon), demonstrations.initial_states)
         self.truth = known[self.rows]
         some = torch.randperm(len(real), generator=generator("cpu", 0, 8))[: 4 * SAMPLES]
-        self.floor = self.features.scores(real[some].expand(len(self.rows), -1, -1, -1), self.truth)
-        self.fresh = torch.zeros_like(self.floor[0]) if demonstrations.observed else ceiling(self.features, known)
+        self.unit = self.features.scores(real[some].expand(len(self.rows), -1, -1, -1), self.truth).mean(dim=0).clamp(min=1e-9)
+        self.fresh = float((self._fresh(known) / self.unit).mean())
+
+    def _fresh(self, known: Tensor) -> Tensor:
+        """Energy score of fresh demonstrations ``(feature,)``."""
+        if not self.setting.places:
+            return ceiling(self.features, known)
+        moved, whole = Reference.of(SHIFTED, self.demonstrations, self.setting, self.model.horizon), len(self.demonstrations)
+        every = []
+        for row in range(whole):
+            starts = self.demonstrations.initial_states.take(torch.full((whole,), row))
+            every.append(ceiling(self.features, self._encoded(moved.each(starts.observed), starts)))
+        return torch.stack(every).mean(dim=0)
+
+    def skill(self, score: Tensor | float) -> float:
+        """Skill of a mean score."""
+        return (self.fresh + LEAST) / (float(score) + LEAST)
 
     def parts(self) -> list[Demonstrations]:
         """The demonstrations without each left-out one, ``(fold,)``."""
         every = range(len(self.demonstrations))
         return [self.demonstrations.rows([row for row in every if row != out]) for out in self.rows]
 
-    def skill(self, compositions: Sequence[Composition], seed: int) -> Tensor:
-        """Skill ``(fold,)`` of the compositions that were learned without each left-out demonstration."""
+    def score(self, compositions: Sequence[Composition], seed: int) -> Tensor:
+        """Scores ``(fold,)`` of samples of the compositions that were learned without each left-out demonstration."""
         starts = self.demonstrations.initial_states.take(torch.tensor(self.rows).repeat_interleave(SAMPLES))
         draws = [generator("cpu", seed, 9, fold) for fold in range(len(self.rows))]
         sampling = replace(SAMPLING, steps=min(SAMPLING.steps, self.model.max_steps or SAMPLING.steps))
         together = [composition.to(self.model.device) for composition in compositions]
         plans = self.model.sample(together, SAMPLES, sampling, draws, moved(starts.observed, self.model.device)).cpu()
         scores = self.features.scores(self._encoded(plans.flatten(0, 1), starts).unflatten(0, plans.shape[:2]), self.truth)
-        scale = (self.floor.mean(dim=0) - self.fresh).clamp(min=1e-6)
-        return ((self.floor.mean(dim=0) - scores) / scale).mean(dim=1)
+        return (scores / self.unit).mean(dim=1)
 
     def references(self, like: Composition, seed: int) -> dict[str, Tensor]:
-        """Skill ``(fold,)`` of each reference that needs no learning, by name; ``like`` is any composition of the model."""
+        """Scores ``(fold,)`` of each reference that needs no learning, by name; ``like`` is any composition of the model."""
         parts, horizon = self.parts(), self.model.horizon
         return {
-            name: self.skill([replace(like, made=Reference.of(name, part, self.setting, horizon)) for part in parts], seed)
+            name: self.score([replace(like, made=Reference.of(name, part, self.setting, horizon)) for part in parts], seed)
             for name in NAMES
         }
 

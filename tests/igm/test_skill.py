@@ -1,0 +1,173 @@
+"""Combinations of training concepts, pinned states, references as forms, and the form chosen by skill, on an untrained model."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from ftl_lightning.data.demonstrations import Demonstrations, concatenate
+from ftl_lightning.data.normalization import Normalization
+from ftl_lightning.data.pinned import Pinned
+from ftl_lightning.data.references import NAMES, SHIFTED, WARPED
+from ftl_lightning.domains.from_file import own_domain
+from ftl_lightning.few_shot.learner import FewShot
+from ftl_lightning.few_shot.tuned import ModelSettings
+from ftl_lightning.igm.composition import Composition
+from ftl_lightning.igm.concept import KNOWN, Concept
+from ftl_lightning.igm.diffusion import cosine_alpha_bar
+from ftl_lightning.igm.explanation import formula
+from ftl_lightning.igm.forms.combination import Combination
+from ftl_lightning.igm.samplers import SAMPLERS, Sampling
+from ftl_lightning.igm.settings import ADAPTED, COMBINED, MODES, NOT_LEARNED, ONE, InversionSettings
+from ftl_lightning.methods.ftl_igm.model import DiffusionConfig, GenerativeModel
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.training.model_config import Prepared
+from tests.conftest import succeed
+
+HORIZON, TEXTS = 12, ("left", "right", "up")
+ENDS = {"left": (-1.0, 0.0), "right": (1.0, 0.0), "up": (0.0, 1.0), "between": (0.5, 0.5)}
+
+
+def walks(text: str, count: int, seed: int = 0) -> Demonstrations:
+    """Straight paths from a random start, which is observed, and a column that is 0 or 1."""
+    rng = np.random.default_rng(seed)
+    start, share = rng.uniform(-0.3, 0.3, (count, 1, 2)), np.linspace(0, 1, HORIZON)[None, :, None]
+    path = start + share * (np.array(ENDS[text]) + 0.05 * rng.normal(size=(count, 1, 2)))
+    grip = np.broadcast_to((share > 0.5).astype(np.float64), (count, HORIZON, 1))
+    features = {"start": torch.tensor(start[:, 0], dtype=torch.float32)}
+    return Demonstrations.of(list(np.concatenate((path, grip), axis=2)), text, observed=features, state_names=("x", "y", "grip"))
+
+
+@pytest.fixture(scope="module")
+def model() -> FewShot:
+    examples = concatenate([walks(text, 4, seed) for seed, text in enumerate(TEXTS)])
+    domain = own_domain(examples, TEXTS, HORIZON, {})
+    torch.manual_seed(0)
+    config = DiffusionConfig(
+        domain="own",
+        horizon=HORIZON,
+        state_dim=3,
+        concept_dim=6,
+        training_concepts=TEXTS,
+        encoder="none",
+        denoiser_args={"hidden_dim": 16, "depth": 2, "condition_dim": 8},
+        diffusion_steps=10,
+        observed=examples.features,
+    )
+    seen = Normalization.fit(examples.observed["start"])
+    prepared = Prepared(config, domain, Normalization.fit(examples.states), torch.randn(4, 6), seen)
+    net = GenerativeModel(prepared)
+    net.examples = examples
+    settings = ModelSettings(InversionSettings().changed(samples=4), 3, Sampling("dpm_solver", 5, 1.0), 1)
+    return FewShot(net.requires_grad_(False).eval(), settings)
+
+
+def test_the_loss_of_a_combination_is_the_quadratic_function_of_its_weights(model: FewShot) -> None:
+    net, few = model.model, walks("between", 3)
+    draw = torch.Generator().manual_seed(1)
+    draws = net.draws(6, 1.0, draw)
+    states, observed = net.windows(few, torch.zeros(6, dtype=torch.int64), torch.zeros(6), draw)
+    products = net.products(states, observed, draws, "clean")
+    weights = torch.tensor([0.7, -0.4, 1.3])
+    composition = Composition(net.training_embeddings[None, :, None], weights[None])
+    direct = net.losses(states, observed, composition, draws, "clean")[0]
+    linear, square = products[:, 0, 1:] @ weights, torch.einsum("i,sij,j->s", weights, products[:, 1:, 1:], weights)
+    torch.testing.assert_close(products[:, 0, 0] - 2 * linear + square, direct, rtol=1e-4, atol=1e-5)
+
+
+def test_a_combination_is_the_minimum_and_folds_leave_one_out(model: FewShot) -> None:
+    few = walks("between", 4)
+    combination = Combination.of(model.model, few, model.tuned.inversion)
+    assert combination.own < 1
+    assert combination.folds.shape == (4, 3)
+    assert combination.left_out.shape == (4,)
+    single = Combination.of(model.model, few.rows([0]), model.tuned.inversion)
+    assert single.folds is None
+    assert single.weights.shape == (3,)
+
+
+@pytest.mark.parametrize("sampler", SAMPLERS)
+def test_every_sampler_keeps_pinned_states(sampler: str) -> None:
+    mask, values = torch.zeros(5, 20, 2, dtype=torch.bool), torch.zeros(5, 20, 2)
+    mask[:, 0], mask[:, -1, 0] = True, True
+    values[:, 0], values[:, -1] = torch.linspace(-0.5, 0.5, 5)[:, None], 0.7
+    draw = torch.Generator().manual_seed(0)
+
+    def noise() -> Tensor:
+        return torch.randn(5, 20, 2, generator=draw)
+
+    plans = Sampling(sampler, 10, 1.0).run(lambda x, t: 0.9 * x, noise, cosine_alpha_bar(10), Pinned(mask, values))
+    assert torch.equal(plans[mask], values[mask])
+
+
+def test_the_correction_of_a_pinned_state_fades_and_has_no_step() -> None:
+    mask, values = torch.zeros(1, 50, 1, dtype=torch.bool), torch.ones(1, 50, 1)
+    mask[:, 0] = True
+    moved = Pinned(mask, values)(torch.zeros(1, 50, 1))[0, :, 0]
+    assert moved[0] == 1
+    assert float(moved.diff().abs().max()) < 0.2
+    assert float(moved[20:].abs().max()) < 0.01
+
+
+def test_the_observed_start_and_pins_are_kept_exactly_and_free_columns_are_free(model: FewShot) -> None:
+    observed = walks("up", 6, 5).initial_states
+    plans = model.sample(model["up"], observed=observed)
+    assert torch.equal(plans.states[:, 0, :2], observed.observed["start"])
+    assert set(plans.states[..., 2].unique().tolist()) <= {0.0, 1.0}
+    pinned = model.sample(model["up"], observed=observed, pin={-1: [0.25, np.nan, 1.0], 3: np.full((6, 3), 0.5)})
+    assert torch.equal(pinned.states[:, -1, 0], torch.full((6,), 0.25))
+    assert torch.equal(pinned.states[:, 3], torch.full((6, 3), 0.5))
+    assert len(pinned.states[:, -1, 1].unique()) > 1
+    for pin, error in (
+        ({12: [0, 0, 0]}, "times from -12 to 11"),
+        ({0: [0, 0]}, "a state of 3 columns"),
+        ({0: [0, np.inf, 0]}, "finite"),
+    ):
+        with pytest.raises(UserError, match=f"pin.*{error}"):
+            model.sample(model["up"], observed=observed, pin=pin)
+
+
+@pytest.mark.parametrize("form", [COMBINED, *NOT_LEARNED])
+def test_forms_that_learn_no_embedding_are_kept_sampled_and_composed(model: FewShot, form: str) -> None:
+    learned = model.learn(walks("between", 4), name="between", form=form)
+    learned.save("c.safetensors")
+    again, fresh = model.load("c.safetensors"), walks("between", 3, 7).initial_states
+    first, second = model.sample(learned, observed=fresh).states, model.sample(again, observed=fresh).states
+    assert torch.equal(first, second)
+    assert torch.equal(first[:, 0, :2], fresh.observed["start"])
+    assert (learned.concept.reference is not None) == (form in NOT_LEARNED)
+    assert model.sample(again + 0.5 * model["up"], observed=fresh).states.isfinite().all()
+    before = Path("c.safetensors").read_bytes()
+    Concept.load("c.safetensors").save("c.safetensors")
+    assert Path("c.safetensors").read_bytes() == before
+    if form == SHIFTED:
+        right = fresh.observed["start"] + torch.tensor(ENDS["between"])
+        assert float((first[:, -1, :2] - right).norm(dim=1).max()) < 0.3
+
+
+def test_the_form_of_ones_own_data_is_chosen_by_skill_beside_references(model: FewShot) -> None:
+    learned = model.learn(walks("between", 4), name="between")
+    choice = learned.concept.choice
+    assert set(choice.skills) == {COMBINED, ONE, ADAPTED, MODES, KNOWN, *NAMES}
+    assert choice.form in (SHIFTED, WARPED)  # an untrained model is no rival
+    assert "no learned form is as good on left-out demonstrations" in choice.because
+    assert all(0 < skill < 2 for skill in choice.skills.values())
+    assert f"{choice.form} has skill {choice.skills[choice.form]:.2f} on left-out demonstrations (without learning: " in str(
+        learned.quality
+    )
+    two = model.learn(walks("between", 2), name="between").concept.choice
+    assert MODES not in two.skills
+    assert model.learn(walks("between", 1), name="between").concept.choice.form == ONE
+
+
+def test_a_combination_is_explained_by_its_formula(model: FewShot, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    training = model.model.training_embeddings
+    assert formula(training[[0, 2], None], torch.tensor([0.5, -0.25]), TEXTS, training) == "0.50 left - 0.25 up"
+    assert formula(training[[0], None] + 0.1, torch.tensor([0.5]), TEXTS, training) == ""
+    learned = model.learn(walks("between", 4), name="between", form=COMBINED)
+    model.save_pretrained(tmp_path / "pretrained")
+    learned.save(tmp_path / "between.safetensors")
+    succeed("explain", str(tmp_path / "between.safetensors"), "--pretrained", str(tmp_path / "pretrained"))
+    assert "combination of training concepts: " in capsys.readouterr().out
