@@ -13,6 +13,9 @@ from ftl_lightning.data.demonstrations import Demonstrations, paths_of
 from ftl_lightning.data.features import moved
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import Concept
+from ftl_lightning.igm.explanation import formula
+from ftl_lightning.igm.forms.choice import combined
+from ftl_lightning.igm.forms.combination import Combination
 from ftl_lightning.igm.forms.leave_one_out import LeaveOneOut, leave_one_out, relative_losses
 from ftl_lightning.igm.settings import InversionSettings
 from ftl_lightning.services.errors import about, require, short
@@ -72,6 +75,7 @@ class Check:
         findings: faults and notes, errors and warnings first.
         known: the training concept that explains them best; ``None`` without a model.
         left_out: leave-one-out losses; ``None`` without learning.
+        combination: report on weighted sums of training concepts; empty without a model of a user's data.
     """
 
     name: str
@@ -79,6 +83,7 @@ class Check:
     findings: tuple[Finding, ...]
     known: Known | None = None
     left_out: LeaveOneOut | None = None
+    combination: str = ""
 
     @property
     def warnings(self) -> tuple[Finding, ...]:
@@ -96,6 +101,7 @@ class Check:
         rest = len(findings) - MOST_FAULTS
         lines += findings if rest <= 0 else [*findings[:MOST_FAULTS], f"  and {rest} more"]
         lines += [] if self.known is None else [f"  {self.known}"]
+        lines += [f"  {self.combination}"] if self.combination else []
         lines += [] if self.left_out is None else [f"  {line}" for line in self.left_out.lines() if line]
         return "\n".join(lines)
 
@@ -167,7 +173,20 @@ def check_with(
         with bar(f"{name}: learning from some", steps) if progress else nothing as advance:
             left = leave_one_out(model, demonstrations, settings, steps, lambda loss: advance(1, f"loss {loss:.3g}"))
     ordered = tuple(sorted(faults, key=lambda finding: finding.severity == "note"))
-    return Check(name, demonstrations, ordered, known, left)
+    return Check(name, demonstrations, ordered, known, left, combination_line(model, demonstrations, settings))
+
+
+def combination_line(model: ConceptModel, demonstrations: Demonstrations, settings: InversionSettings) -> str:
+    """Report on the best weighted sum of training concepts, by the loss of left-out demonstrations; for a user's data."""
+    combination = None if model.examples is None else Combination.of(model, demonstrations, settings)
+    if combination is None or combination.left_out is None:
+        return ""
+    sets = combined(model, combination.weights)
+    text = formula(sets.embeddings, sets.weights, model.config.training_concepts, model.training_embeddings.cpu())
+    loss = float(combination.left_out.mean())
+    verdict = "explains" if loss <= MARGIN else "does not explain"
+    unseen = f"demonstrations that its weights were not learned from (loss {loss:.2f} of the empty concept's)"
+    return f"sum: {short(text, 120)} {verdict} {unseen}"
 
 
 def longer_than_plans(demonstrations: Demonstrations, model: ConceptModel) -> str:

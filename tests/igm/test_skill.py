@@ -1,5 +1,6 @@
 """Combinations of training concepts, pinned states, references as forms, and the form chosen by skill, on an untrained model."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,9 @@ from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import KNOWN, Concept
 from ftl_lightning.igm.diffusion import cosine_alpha_bar
 from ftl_lightning.igm.explanation import formula
+from ftl_lightning.igm.forms.choice import _by_skill
 from ftl_lightning.igm.forms.combination import Combination
+from ftl_lightning.igm.forms.skill import LeftOut
 from ftl_lightning.igm.samplers import SAMPLERS, Sampling
 from ftl_lightning.igm.settings import ADAPTED, COMBINED, MODES, NOT_LEARNED, ONE, InversionSettings
 from ftl_lightning.methods.ftl_igm.model import DiffusionConfig, GenerativeModel
@@ -169,5 +172,22 @@ def test_a_combination_is_explained_by_its_formula(model: FewShot, tmp_path: Pat
     learned = model.learn(walks("between", 4), name="between", form=COMBINED)
     model.save_pretrained(tmp_path / "pretrained")
     learned.save(tmp_path / "between.safetensors")
-    succeed("explain", str(tmp_path / "between.safetensors"), "--pretrained", str(tmp_path / "pretrained"))
+    succeed("explain", "--concept", str(tmp_path / "between.safetensors"), "--pretrained", str(tmp_path / "pretrained"))
     assert "combination of training concepts: " in capsys.readouterr().out
+
+
+def test_check_tries_sums_of_training_concepts(model: FewShot) -> None:
+    report = str(model.check(walks("between", 4), name="between"))
+    assert "  sum: " in report
+    assert "its weights were not learned from (loss " in report
+
+
+def test_without_places_a_shifted_demonstration_is_a_copy_and_is_not_chosen(model: FewShot) -> None:
+    few = walks("between", 4)
+    left = LeftOut(model.model, few, model.model.examples)
+    scores = {name: torch.full((4,), 2.0) for name in (COMBINED, ONE)}
+    references = {name: torch.ones(4) for name in NAMES} | {SHIFTED: torch.full((4,), 0.5)}
+    assert _by_skill(scores, references, left)[0] == SHIFTED
+    left.setting = replace(left.setting, places={})
+    assert _by_skill(scores, references, left)[0] == WARPED
+    assert _by_skill({name: score / 4 for name, score in scores.items()}, references, left)[0] == COMBINED

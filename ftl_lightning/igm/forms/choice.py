@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.data.demonstrations import Demonstrations, concatenate
-from ftl_lightning.data.references import Reference, Setting
+from ftl_lightning.data.references import WARPED, Reference, Setting
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import KNOWN, SKILL, Choice, Concept
 from ftl_lightning.igm.forms.combination import Combination
@@ -210,7 +210,8 @@ def _by_skill(learned: Mapping[str, Tensor], references: Mapping[str, Tensor], l
     means = {name: float(score.mean()) for name, score in {**learned, **references}.items()}
     best = min(learned, key=lambda name: means[name])
     form = next(name for name, score in learned.items() if _within(score, learned[best]))
-    rival, other = min(references, key=lambda name: means[name]), min(NOT_LEARNED, key=lambda name: means[name])
+    offered = NOT_LEARNED if left.setting.places else (WARPED,)  # without places a shifted demonstration is a copy
+    rival, other = min(references, key=lambda name: means[name]), min(offered, key=lambda name: means[name])
     skill = {name: f"{left.skill(mean):.2f}" for name, mean in means.items()}
     if means[other] < means[form]:
         return other, f"no learned form is as good on left-out demonstrations: {form} has skill {skill[form]}, this {skill[other]}"
