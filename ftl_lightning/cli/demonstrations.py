@@ -1,5 +1,6 @@
 """Verbs for demonstrations: ``generate``, ``check``, ``encode``, ``prepare``. Imports are local, for a fast start."""
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,8 +16,8 @@ if TYPE_CHECKING:
     from ftl_lightning.training.checks import Check
 
 
-MOST_DEMONSTRATIONS, MOST_WORKERS = 1_000_000, 1000
-"""Maximum number of demonstrations drawn by a command, and of worker processes."""
+MOST_DEMONSTRATIONS, MOST_WORKERS, MOST_CONCEPTS = 1_000_000, 1000, 200
+"""Maximum number of demonstrations drawn by a command, of worker processes, and of concepts of a check."""
 
 
 def generate(
@@ -126,7 +127,7 @@ class CheckOptions:
 
 def check(options: CheckOptions) -> None:
     """Check every concept of the file in ``options``; print and draw the results."""
-    from ftl_lightning.data.check import axes, read_mended
+    from ftl_lightning.data.check import axes, read_mended, with_kinds
     from ftl_lightning.few_shot.learner import FewShot
 
     demonstrations, broken = read_mended(options.file)
@@ -134,11 +135,19 @@ def check(options: CheckOptions) -> None:
     if model is not None:
         with about(options.file):
             demonstrations = model.demonstrations(demonstrations, name=Path(options.file).stem)
+    else:
+        with suppress(UserError):  # the check of a concept names the fault
+            demonstrations, proposed = with_kinds(demonstrations)
+            for text in proposed:
+                note(f"{options.file}: {text}")
     for text in (*alike(demonstrations.concepts), *map(str, axes(demonstrations))):
         note(f"{options.file}: {text}")
-    checks = []
-    for text in dict.fromkeys(demonstrations.concepts):
-        rows = [row for row, concept in enumerate(demonstrations.concepts) if concept == text]
+    checks, rows_of = [], dict[str, list[int]]()
+    for row, text in enumerate(demonstrations.concepts):
+        rows_of.setdefault(text, []).append(row)
+    if len(rows_of) > MOST_CONCEPTS:
+        note(f"{options.file}: the first {MOST_CONCEPTS} of {len(rows_of)} concepts are checked")
+    for rows in list(rows_of.values())[:MOST_CONCEPTS]:
         faults = tuple(fault.within(rows) for fault in broken if set(fault.rows) <= set(rows))
         checks.append(_checked(model, demonstrations.rows(rows), faults, options.learn))
         for text_line in str(checks[-1]).splitlines():

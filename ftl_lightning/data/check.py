@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.data.demonstrations import Demonstrations, paths_of, read_contents
-from ftl_lightning.data.kinds import Columns, resolved
+from ftl_lightning.data.kinds import LINEAR, Columns, resolved
 from ftl_lightning.services.errors import UserError, about, short
 
 T = TypeVar("T")
@@ -33,7 +33,9 @@ UNITS = 10.0  # ratio of values that suggests other units
 APART = {3: 25.0, 4: 12.0}  # ratio to the usual distance that makes an outlier, by the number of demonstrations
 APART_PLACES, APART_SHAPES = 12.0, 4.0  # ratios for five and more: of states, and of their shapes regardless of place and size
 CLOSEST = {3: 0.5}  # minimum usual distance, as a share of the others' spread, by the number of demonstrations; otherwise 0.1
-MOST_CHECKED, MOST_LINES = 2000, 2  # demonstrations that are checked before pretraining, and lines of findings
+MANY, SELDOM = 20, 0.1  # demonstrations from which on columns that a smaller share of them uses make no outlier
+MOST_COMPARED = 50  # demonstrations, evenly taken, whose distances among them are usual for an outlier
+MOST_CHECKED, MOST_LINES = 1000, 2  # demonstrations that are checked before pretraining, and lines of findings
 LEAST_AXIS = 5  # more entries of an axis than this make it a possible time
 SMOOTH_AXIS, EXCHANGED = 0.6, 3.0  # maximum roughness of an exchanged time axis, and minimum ratio of the other's to it
 ROUGH_TIME = 0.9  # minimum roughness along what is no time
@@ -124,8 +126,12 @@ def read_mended(path: str) -> tuple[Demonstrations, tuple[Finding, ...]]:
 def check(demonstrations: Demonstrations) -> tuple[Finding, ...]:
     """Check demonstrations as examples of a single concept, ignoring their texts; notes are last.
 
-    A demonstration with a finding is excluded from later checks. Axes are checked by :func:`axes`, for all concepts together.
+    A demonstration with a finding is excluded from later checks. At most :data:`MOST_CHECKED` demonstrations are checked. Axes are
+    checked by :func:`axes`, for all concepts together.
     """
+    if (count := len(demonstrations)) > MOST_CHECKED:
+        part = Finding(f"the first {MOST_CHECKED} of {count} demonstrations are checked", "note")
+        return (*check(demonstrations.rows(list(range(MOST_CHECKED)))), part)
     few = Finding("three to five demonstrations are usual; fewer do not show which of them is odd", "note")
     demonstrations, kinds = _continuous(demonstrations)
     findings = [*([few] if len(demonstrations) < 3 else []), *kinds, *_constant(demonstrations)]
@@ -155,6 +161,19 @@ def check_each(demonstrations: Demonstrations) -> list[str]:
         found += [f"{short(name, 40)}: {finding}" for finding in check(some) if finding.severity != "note"]
     more = len(found) - MOST_LINES
     return found if more <= 0 else [*found[: MOST_LINES - 1], f"{more + 1} more; list them: python -m ftl_lightning check"]
+
+
+def with_kinds(demonstrations: Demonstrations) -> tuple[Demonstrations, list[str]]:
+    """Demonstrations with proposed kinds unless kinds are known, and notes on proposals. All concepts show what a column is."""
+    names, kinds = demonstrations.state_names, demonstrations.state_kinds
+    try:
+        known = bool(kinds) and bool(Columns(kinds).groups)
+    except UserError:
+        known = False  # kinds of a file are not resolved
+    if known:
+        return demonstrations, []
+    kinds = resolved(paths_of(demonstrations), names, demonstrations.state_units, kinds or ("",) * len(names), "states")
+    return replace(demonstrations, state_kinds=kinds or (LINEAR,) * len(names)), list(Columns(kinds).notes(names))
 
 
 def axes(demonstrations: Demonstrations) -> Iterator[Finding]:
@@ -233,18 +252,14 @@ def _channels_first(states: Tensor) -> bool:
 
 def _continuous(demonstrations: Demonstrations) -> tuple[Demonstrations, list[Finding]]:
     """Demonstrations with continuous columns of their kinds, which are proposed unless known, and findings about proposals."""
-    names, kinds, findings = demonstrations.state_names, demonstrations.state_kinds, list[Finding]()
+    names, findings = demonstrations.state_names, list[Finding]()
     try:
-        known = bool(kinds) and bool(Columns(kinds).groups)
-    except UserError:
-        known = False  # kinds of a file are not resolved
-    if not known:
-        try:
-            kinds = resolved(paths_of(demonstrations), names, demonstrations.state_units, kinds or ("",) * len(names), "states")
-        except UserError as error:
-            findings, kinds = [Finding(str(error).removeprefix("states: "), "error")], ()
-        findings += [Finding(text, "note") for text in Columns(kinds).notes(names)]
-    columns, double = Columns(kinds), demonstrations.states.dtype == torch.float64
+        demonstrations, notes = with_kinds(demonstrations)
+        findings = [Finding(text, "note") for text in notes]
+    except UserError as error:
+        demonstrations = replace(demonstrations, state_kinds=())
+        findings = [Finding(str(error).removeprefix("states: "), "error")]
+    columns, double = Columns(demonstrations.state_kinds), demonstrations.states.dtype == torch.float64
     if not columns and not double:
         return demonstrations, findings
     states = columns.encode(demonstrations.states)
@@ -268,9 +283,9 @@ def _paths(demonstrations: Demonstrations) -> list[Tensor]:
 
 def _points(paths: list[Tensor]) -> Tensor:
     """Resample paths ``(time, state)`` of any lengths at even times, ``(demo, point, state)``."""
-    points = []
+    points, count = [], POINTS if max(map(len, paths)) > 1 else 1
     for path in paths:
-        times = torch.linspace(0, len(path) - 1, POINTS if max(map(len, paths)) > 1 else 1, dtype=torch.double)
+        times = torch.linspace(0, len(path) - 1, count, dtype=torch.double)
         before = times.floor().long().clamp(max=len(path) - 1)
         after = (before + 1).clamp(max=len(path) - 1)
         points.append(path[before] + (times - before)[:, None] * (path[after] - path[before]))
@@ -319,20 +334,25 @@ def _duplicates(demonstrations: Demonstrations) -> Iterator[Finding]:
     """Find copies by states and observed features."""
     paths, gaps = _paths(demonstrations), distances(demonstrations)
     usual = float(_pairs(gaps).median()) if len(paths) > 2 else 1.0
-    for values in demonstrations.observed.values():
-        flat = values.double().flatten(1)
-        differ = (flat[:, None] - flat).abs() > ALIKE * flat.std(dim=0, correction=0)
-        gaps = gaps.masked_fill(differ.any(dim=2), torch.inf)
+    observed = [values.double().flatten(1) for values in demonstrations.observed.values()]
+    tolerances = [ALIKE * values.std(dim=0, correction=0) for values in observed]
+
+    def differ(first: int, row: int) -> Iterator[bool]:
+        for values, most in zip(observed, tolerances, strict=True):
+            yield bool(((values[first] - values[row]).abs() > most).any())
+
     size = min(len(path) for path in paths) * paths[0].shape[1]
     limit = max(ALIKE * usual if size >= ENOUGH else 0.0, SAME)
     remaining = list(range(len(paths)))
     while remaining:
         first, *rest = remaining
-        copies = [row for row in rest if gaps[first, row] <= limit]
+        near = gaps[first].tolist()
+        copies = [row for row in rest if near[row] <= limit and not any(differ(first, row))]
         if copies:
             exact = all(torch.equal(paths[first], paths[row]) for row in copies)
             yield Finding("are the same" if exact else "are nearly the same; they count once", rows=(first, *copies))
-        remaining = [row for row in rest if row not in copies]
+        known = {*copies}
+        remaining = [row for row in rest if row not in known]
 
 
 def _stills(demonstrations: Demonstrations) -> Iterator[Finding]:
@@ -376,15 +396,18 @@ def _jumps(demonstrations: Demonstrations) -> Iterator[Finding]:
     paths = _paths(demonstrations)
     states, steps = torch.cat(paths), [path.diff(dim=0).abs() for path in paths]
     continuous = [column for column in range(states.shape[1]) if len(states[:, column].unique()) > DISCRETE]
+    none = torch.zeros((1, len(continuous)), dtype=torch.double)
+    tops = torch.stack([torch.cat((sizes[:, continuous], none)).amax(dim=0) for sizes in steps])  # steps are at least 0
+    count, two = sum(map(len, steps)), tops.topk(min(2, len(tops)), dim=0).values
     for row, sizes in enumerate(steps if continuous else ()):
-        rest = torch.cat(_others(steps, row) or [sizes[:0]])
+        rest = torch.where(tops[row] < two[0], two[0], two[-1] if len(tops) > 1 else none[0])  # the largest of the others
         many = 1 if len(steps) > 1 and len(sizes) >= ENOUGH else 4  # among few steps a movement may stand out more
         worst = (0.0, 0, 0)
         for time in sizes[:, continuous].argmax(dim=0).unique().tolist() if len(sizes) else ():
-            others = torch.cat((sizes[: max(time - 1, 0)], sizes[time + 2 :], rest))[:, continuous]  # a blip is two jumps
-            if len(others) < ENOUGH:
+            others = torch.cat((sizes[: max(time - 1, 0)], sizes[time + 2 :]))[:, continuous]  # a blip is two jumps
+            if len(others) + count - len(sizes) < ENOUGH:
                 continue
-            largest = others.amax(dim=0)
+            largest = torch.cat((others, rest[None])).amax(dim=0)
             ratios = torch.where(largest > 0, sizes[time, continuous] / largest.clamp(min=1e-30), 0)
             order = ratios.argsort(descending=True)
             if ratios[order[0]] > many * JUMP_ALONE or (len(order) > 1 and ratios[order[1]] > many * JUMP):
@@ -436,27 +459,42 @@ def _outliers(demonstrations: Demonstrations) -> Iterator[Finding]:
     count, points = len(demonstrations), _points(_paths(demonstrations))
     if count < 3:
         return
+    if count >= MANY:  # the usual spread of a column that few demonstrations use says nothing about them
+        used = (points != points.flatten(0, 1).median(dim=0).values).any(dim=1).double().mean(dim=0) >= SELDOM
+        points = points[:, :, used | ~used.any()]
     views = [(points / _spread(points), APART_PLACES, "is far from the others")]
     if points.shape[1] > 1:
         views.append((_shapes(points), APART_SHAPES, "moves otherwise than the others"))
     reported: set[int] = set()
     for view, limit, words in views:
+        spreads = _spreads_of_others(view)
         for row in range(count):
-            ratio, beyond = _far(view, row)
+            ratio, beyond = _far(view, spreads, row)
             if row not in reported and ratio > APART.get(count, limit) and (count < 5 or beyond > BEYOND):
                 reported.add(row)
                 yield Finding(f"{words}: {ratio:.0f} times the usual distance among them; another concept?", rows=(row,))
 
 
-def _far(points: Tensor, row: int) -> tuple[float, float]:
+def _spreads_of_others(points: Tensor) -> Tensor:
+    """Standard deviations of all other demonstrations ``(demo, state)``, of points ``(demo, point, state)``.
+
+    At least 0.1 of that of all.
+    """
+    centred = points - points.mean(dim=(0, 1))
+    first, second, count = centred.sum(dim=1), centred.square().sum(dim=1), (len(points) - 1) * points.shape[1]
+    means, squares = (first.sum(dim=0) - first) / count, (second.sum(dim=0) - second) / count
+    return torch.maximum((squares - means.square()).clamp(min=0).sqrt(), 0.1 * centred.square().mean(dim=(0, 1)).sqrt())
+
+
+def _far(points: Tensor, spreads: Tensor, row: int) -> tuple[float, float]:
     """Distance of a demonstration from the others relative to distances among them: ratio of medians, and minimum over maximum.
 
     Columns are scaled by the spread of the others, so that an outlier does not inflate it.
     """
-    others = _others(range(len(points)), row)
-    all_spread, spread = (part.flatten(0, 1).std(dim=0, correction=0) for part in (points, points[others]))
-    scale = torch.maximum(spread, 0.1 * all_spread)
-    separations = _apart(points / torch.where(scale > SAME, scale, 1))
-    gaps, among = separations[row, others], _pairs(separations[others][:, others])
+    others, scale = _others(range(len(points)), row), spreads[row]
+    scaled = (points / torch.where(scale > SAME, scale, 1)).flatten(1)
+    gaps = (scaled[others] - scaled[row]).square().mean(dim=1).sqrt()
+    some = others[:: -(-len(others) // MOST_COMPARED)]
+    among = _pairs(_apart(scaled[some]))
     closest = CLOSEST.get(len(points), 0.1)
     return float(gaps.median() / among.median().clamp(min=closest)), float(gaps.min() / among.max().clamp(min=closest))

@@ -53,6 +53,8 @@ class Format:
     write: Callable[["Demonstrations", str], None]
 
 
+MOST_COLUMNS = 10_000
+"""Maximum number of columns of states in a file."""
 FOREIGN = (".pkl", ".pickle", ".joblib", ".xlsx", ".xls", ".feather", ".zarr", ".bag", ".mcap", ".tfrecord", ".txt", ".gz", ".zip")
 """Suffixes of files that are not read."""
 FORMATS: dict[str, Format] = {}
@@ -64,6 +66,8 @@ def read_contents(path: str | Path) -> Contents:
     kind, name = read_from(str(path))
     contents = _format(kind, name).read(name)
     states, lengths = contents["states"], contents["lengths"]
+    columns = states.shape[2] if states.dim() == 3 else 0
+    require(columns <= MOST_COLUMNS, f"{name}: key 'states'", f"at most {MOST_COLUMNS} columns", columns)
     whole = lengths.dtype == torch.int64 and lengths.shape == states.shape[:1]
     if states.dim() == 3 and whole and bool(((lengths >= 1) & (lengths <= states.shape[1])).all()):
         contents["states"] = held(states, lengths)

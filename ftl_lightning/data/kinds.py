@@ -45,6 +45,8 @@ TURNS = {
 """A whole turn by unit."""
 SHORT_TURNS = ("rad", "deg", "mrad", "turns", "grad")
 """Units of angles, for messages."""
+MOST_PROPOSED = 300
+"""Maximum number of columns for which kinds are proposed; more are taken as linear."""
 UNIT_NORM, STILL = 2e-2, 1e-3
 """Maximum error of the norm of a quaternion or a row of a rotation matrix and of their products, as after rounding to two decimals;
 maximum change of a column that does not move.
@@ -213,7 +215,7 @@ def declared(names: Sequence[str], of_file: Sequence[str], given: Mapping[str, s
 def resolved(
     paths: Sequence[Tensor], names: Sequence[str], units: Sequence[str], kinds: Sequence[str], place: str
 ) -> tuple[str, ...]:
-    """Complete declared kinds by what the data show, and propose kinds for the other columns.
+    """Complete declared kinds by what the data show, and propose kinds for the others of at most :data:`MOST_PROPOSED` columns.
 
     Args:
         paths: states ``(time, state)`` of each demonstration, without padding.
@@ -230,10 +232,10 @@ def resolved(
     """
     every = torch.cat(list(paths)).double()
     groups: list[Group] = []
-    column = 0
+    column, few = 0, len(names) <= MOST_PROPOSED
     while column < len(names):
         group = _declared_group(paths, every, names, units, kinds, column, place) if kinds[column].strip() else None
-        group = group or _proposed(paths, every, names, units, kinds, column, place)
+        group = group or (_proposed(paths, every, names, units, kinds, column, place) if few else Group(LINEAR, column, 1))
         groups.append(group)
         column += group.count
     if all(group.kind == LINEAR for group in groups) and not any(kind.strip() for kind in kinds):

@@ -23,6 +23,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import yaml
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
@@ -138,9 +139,18 @@ def _read(path: Path) -> dict[str, Any]:
 @functools.lru_cache
 def _parsed(text: str) -> object:
     """Content of a YAML file, cached, as commands read it several times."""
-    return OmegaConf.to_container(OmegaConf.load(io.StringIO(text)), resolve=False)
+    depth = 0
+    for event in yaml.parse(text, Loader=yaml.SafeLoader):  # libyaml crashes at lists and mappings that are too deep
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if depth > DEEPEST:
+            raise ValueError(f"lists and mappings deeper than {DEEPEST}")
+    content = OmegaConf.to_container(OmegaConf.load(io.StringIO(text)), resolve=False)
+    str(content)  # a number of thousands of digits is a ValueError
+    return content
 
 
+DEEPEST = 40
+"""Maximum nesting of lists and mappings."""
 LONGEST = 200_000
 """Maximum size of a configuration file in bytes; OmegaConf bounds the expansion of aliases."""
 _DAMAGED = (OSError, ValueError, YAMLError, OmegaConfBaseException, RecursionError, TypeError, LookupError, AssertionError)

@@ -23,7 +23,7 @@ MOST_HEADER = 8 * 2**20
 """Maximum bytes of a safetensors header, which holds a text for each demonstration; scaled by :func:`raised`."""
 MOST_TENSORS = 20_000
 """Maximum number of tensors in a file."""
-MOST_UNPACKED = 128 * 2**20
+MOST_UNPACKED = 32 * 2**20
 """Maximum bytes of unpacked arrays, or :data:`MOST_RATIO` times the bytes of the file if that is more."""
 MOST_RATIO = 100
 

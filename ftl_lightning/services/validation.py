@@ -71,6 +71,8 @@ FLOAT32 = 3.4e38
 """Maximum magnitude of a float."""
 DEEPEST = 40
 """Maximum nesting of lists and mappings."""
+MOST_LISTS, MOST_VALUES = 300_000, 4_000_000
+"""Maximum number of lists, mappings or keys, and of values, of a JSON text: each takes a hundred times its bytes in memory."""
 _LISTS = (tuple, list, collections.abc.Sequence)
 
 T = TypeVar("T")
@@ -87,15 +89,27 @@ def parse_json(text: str | bytes, kind: str = "JSON") -> Any:
     """Parse a JSON text; ``kind`` is the expected kind, for messages.
 
     Raises:
-        UserError: for damaged text, repeated keys, numbers that are not finite, invalid Unicode, or nesting deeper than
-            :data:`DEEPEST`.
+        UserError: for damaged text, repeated keys, numbers that are not finite, invalid Unicode, nesting deeper than
+            :data:`DEEPEST`, more lists than :data:`MOST_LISTS`, or more values than :data:`MOST_VALUES`.
     """
+    check_json_size(text, kind)
     try:
         content = json.loads(text.decode() if isinstance(text, bytes) else text, object_pairs_hook=_once)
     except (ValueError, RecursionError) as error:
         raise UserError(f"expected {kind}, found damaged text or too deep a nesting ({short(str(error))})") from error
     _expect_plain(content, DEEPEST)
     return content
+
+
+def check_json_size(text: str | bytes, kind: str) -> None:
+    """Refuse a JSON text of more than :data:`MOST_LISTS` lists, mappings or keys, or :data:`MOST_VALUES` values.
+
+    Raises:
+        UserError: naming the expected ``kind`` and the number.
+    """
+    for marks, most, what in (("[{", MOST_LISTS, "lists and mappings"), (":", MOST_LISTS, "keys"), (",", MOST_VALUES, "values")):
+        count = sum(text.count(mark.encode() if isinstance(text, bytes) else mark) for mark in marks)  # in texts, too few to matter
+        require(count <= most, "content", f"{kind} of at most {most} {what}", str(count))
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -118,7 +132,11 @@ def _expect_plain(value: object, left: int) -> None:
     elif isinstance(value, dict | list):
         if not left:
             raise UserError(f"expected lists and mappings at most {DEEPEST} deep, found deeper ones")
-        for item in (*value, *value.values()) if isinstance(value, dict) else value:
+        items = (*value, *value.values()) if isinstance(value, dict) else value
+        kinds = set(map(type, items))
+        if kinds <= {int, bool, type(None)} or (kinds == {float} and all(map(math.isfinite, items))):  # fast for numbers
+            return
+        for item in ("".join(items),) if kinds == {str} else items:
             _expect_plain(item, left - 1)
 
 
@@ -195,6 +213,10 @@ def check_type(value: Any, kind: Any, key: str) -> Any:
     if origin in (dict, collections.abc.Mapping):
         return {name: check_type(item, arguments[1], _joined(key, name)) for name, item in value.items()}
     if origin in _LISTS:
+        if set(map(type, value)) == {arguments[0]} <= {str, int} and (
+            arguments[0] is str or 0 <= min(value) <= max(value) <= LARGEST
+        ):
+            return tuple(value) if origin is tuple else list(value)
         items = (check_type(item, arguments[0], f"{key}[{index}]") for index, item in enumerate(value))
         return tuple(items) if origin is tuple else list(items)
     return value

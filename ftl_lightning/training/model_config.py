@@ -23,6 +23,10 @@ LONGEST = 10_000
 """Maximum number of states in a plan; networks over time have the same weights for any horizon."""
 
 
+MOST_CONCEPTS = 20_000
+"""Maximum number of training concepts of a model."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class ModelConfig(Sizes):
     """Configuration to build a model before its weights are read; each method adds options of its network.
@@ -56,6 +60,7 @@ class ModelConfig(Sizes):
         check_range("horizon", self.horizon, 1, LONGEST)
         check_range("state_dim", self.state_dim, 1, LARGEST)
         check_range("concept_dim", self.concept_dim, 1, LARGEST)
+        check_range("key 'training_concepts': number", len(self.training_concepts), 0, MOST_CONCEPTS)
         check_range("observed, image_dim", self.vector_dim, 0, LARGEST)
 
 

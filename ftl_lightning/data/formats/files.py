@@ -6,6 +6,7 @@ import struct
 import tokenize
 import zipfile
 import zlib
+from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import IO, Any
@@ -16,7 +17,7 @@ from torch import Tensor
 
 from ftl_lightning.data.demonstrations import FORMATS, KIND, OBSERVED, Contents, Demonstrations, Format
 from ftl_lightning.services.errors import UserError, about, require, short
-from ftl_lightning.services.files import MOST_TENSORS, check_unpacked
+from ftl_lightning.services.files import check_unpacked
 from ftl_lightning.services.progress import bar
 from ftl_lightning.services.tensor_file import atomic, cache_folder, content_hash, load_tensors, save_tensors
 from ftl_lightning.services.validation import check_type
@@ -28,6 +29,8 @@ TEXTS = ("state_names", "state_units", "state_kinds", "concepts", "per_step")
 """Keys of lists of texts."""
 MOST_SHRUNK = 1032
 """Maximum compression ratio of zlib."""
+MOST_ARRAYS = 2000
+"""Maximum number of arrays in an ``.npz`` file."""
 SLOW = 20
 """Minimum number of demonstrations for progress lines without a terminal."""
 DAMAGED = (
@@ -137,9 +140,11 @@ def check_arrays(path: Path, size: int) -> None:
     """
     with zipfile.ZipFile(path) as archive:
         members = archive.infolist()
-        if len(members) > MOST_TENSORS:
-            raise ValueError(f"{len(members)} arrays")
+        names = Counter(member.filename.removesuffix(".npy") for member in members)
         with about(path):
+            require(len(members) <= MOST_ARRAYS, "content", f"at most {MOST_ARRAYS} arrays", str(len(members)))
+            for name, count in names.most_common(1):
+                require(count == 1, f"key {short(name)!r}", "it once", "it several times")
             check_unpacked(sum(member.file_size for member in members), size, "arrays")
         for member in members:
             with archive.open(member) as file:

@@ -43,6 +43,8 @@ EPISODE, TASK, LENGTH = "episode_index", "task_index", "length"
 FRAME, TIME = "frame_index", "timestamp"
 METADATA = Path("meta") / "ftl_lightning.json"
 """File of :class:`~ftl_lightning.data.formats.episodes.Metadata`, if this package has written the data set."""
+MOST_FEATURES = 2000
+"""Maximum number of features."""
 _ADDED = (TIME, FRAME, EPISODE, "index", TASK)
 """Features that LeRobot adds to every frame."""
 _DATA = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
@@ -146,6 +148,7 @@ def _info(root: Path) -> tuple[str, int, float | None, dict[str, _Feature]]:
         inside = data.startswith("data/") and ".." not in Path(data).parts
         require(inside, "key 'data_path'", "files in the folder 'data'", shown(data))
         features = check_type(content.get("features"), Mapping[str, Mapping[str, Any]], "features")
+        require(len(features) <= MOST_FEATURES, "key 'features'", f"at most {MOST_FEATURES}", len(features))
         episodes = check_type(content.get("total_episodes"), int, "total_episodes")
         fps: float | None = check_type(content.get("fps"), float | None, "fps")
         require(fps is None or fps > 0, "key 'fps'", "frames per second, more than 0", fps)

@@ -29,7 +29,7 @@ from ftl_lightning.services.errors import UserError, about, note, require, short
 from ftl_lightning.services.files import check_readable, check_unpacked, read_text
 from ftl_lightning.services.shipped import check_extra
 from ftl_lightning.services.text import line
-from ftl_lightning.services.validation import LARGEST, check_type, from_mapping
+from ftl_lightning.services.validation import LARGEST, check_json_size, check_type, from_mapping
 
 CONCEPT, SCENE = "concept", "scene"
 """Keys of an episode's text and scene, see this module."""
@@ -104,7 +104,9 @@ def _contents(name: str, part: str = "", observed: Sequence[str] | None = None) 
 def _check_metadata(folder: Path) -> None:
     """Refuse metadata that let Minari run code, or that ask for more memory than the data can fill."""
     path = folder / "metadata.json"
-    content = check_type(json.loads(read_text(path, "Minari")), Mapping[str, Any], "")
+    text = read_text(path, "Minari")
+    check_json_size(text, "metadata")
+    content = check_type(json.loads(text), Mapping[str, Any], "")
     episodes = check_type(content.get("total_episodes"), int, "total_episodes")
     for key in ("observation_space", "action_space"):  # without them, Minari makes the environment that the file names
         _check_space(json.loads(check_type(content.get(key), str, key)), key)

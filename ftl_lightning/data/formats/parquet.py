@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from ftl_lightning.services.errors import UserError, about, require, short
 from ftl_lightning.services.files import MOST_TENSORS, MOST_TEXT, check_readable, check_unpacked
 from ftl_lightning.services.tensor_file import visible
+from ftl_lightning.services.validation import LARGEST
 
 _DAMAGED = (pa.ArrowException, OSError, ValueError, TypeError, KeyError, IndexError, OverflowError, MemoryError)
 """Exceptions of pyarrow for damaged or foreign files."""
@@ -108,6 +109,8 @@ def read_lines(path: Path, kinds: Mapping[str, Literal["int64", "string"]]) -> d
     """
     check_readable(path, "LeRobot", MOST_TEXT)
     content = path.read_bytes().removeprefix(codecs.BOM_UTF8)
+    count = content.count(b"{")
+    require(count <= LARGEST, str(path), f"at most {LARGEST} JSON objects", str(count))
     schema = pa.schema([pa.field(name, pa.type_for_alias(kind)) for name, kind in kinds.items()])
     parsing = pj.ParseOptions(explicit_schema=schema, unexpected_field_behavior="ignore")
     reading = pj.ReadOptions(use_threads=False, block_size=len(content) + 1)  # a line may be as long as the file
