@@ -185,7 +185,7 @@ def reference_hash(configured: Mapping[str, Any]) -> str:
 
 FOLDER = r"\w[\w .+-]{0,99}"
 """Pattern of domain names, which are folder names in a report."""
-MOST_CELLS = 1000
+MOST_CELLS = 10_000
 """Maximum number of cells in a row of a results file, for a fast refusal of other files."""
 LARGEST_WHOLE = 2**53
 """Maximum integer, including seeds."""

@@ -266,7 +266,7 @@ def test_a_minari_space_of_many_parts_is_refused(tmp_path: Path, monkeypatch: py
 @pytest.mark.parametrize("text", [b"," * 10**6, b"domain,task\n" + b"," * 10**6])
 def test_results_of_endless_cells_are_refused(text: bytes, capsys: Told) -> None:
     Path("x.csv").write_bytes(text)
-    expected = "x.csv: rows: expected at most 1000 cells in each, found 1000001"
+    expected = "x.csv: rows: expected at most 10000 cells in each, found 1000001"
     refused(capsys, ["report", "--results", "x.csv", "--out", "out"], expected)
 
 
