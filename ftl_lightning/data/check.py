@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.data.demonstrations import Demonstrations, paths_of, read_contents
+from ftl_lightning.data.features import BLOCK
 from ftl_lightning.data.kinds import LINEAR, Columns, resolved
 from ftl_lightning.services.errors import UserError, about, short
 
@@ -36,6 +37,7 @@ CLOSEST = {3: 0.5}  # minimum usual distance, as a share of the others' spread, 
 MANY, SELDOM = 20, 0.1  # demonstrations from which on columns that a smaller share of them uses make no outlier
 MOST_COMPARED = 50  # demonstrations, evenly taken, whose distances among them are usual for an outlier
 MOST_CHECKED, MOST_LINES = 1000, 2  # demonstrations that are checked before pretraining, and lines of findings
+MOST_WIDTH = 1000  # columns that are checked
 LEAST_AXIS = 5  # more entries of an axis than this make it a possible time
 SMOOTH_AXIS, EXCHANGED = 0.6, 3.0  # maximum roughness of an exchanged time axis, and minimum ratio of the other's to it
 ROUGH_TIME = 0.9  # minimum roughness along what is no time
@@ -134,7 +136,13 @@ def check(demonstrations: Demonstrations) -> tuple[Finding, ...]:
         return (*check(demonstrations.rows(list(range(MOST_CHECKED)))), part)
     few = Finding("three to five demonstrations are usual; fewer do not show which of them is odd", "note")
     demonstrations, kinds = _continuous(demonstrations)
-    findings = [*([few] if len(demonstrations) < 3 else []), *kinds, *_constant(demonstrations)]
+    findings = [*([few] if len(demonstrations) < 3 else []), *kinds]
+    if (width := demonstrations.states.shape[2]) > MOST_WIDTH:
+        findings.append(Finding(f"the first {MOST_WIDTH} of {width} columns are checked", "note"))
+        names, units = demonstrations.state_names[:MOST_WIDTH], ("",) * MOST_WIDTH
+        states = demonstrations.states[..., :MOST_WIDTH]
+        demonstrations = replace(demonstrations, states=states, state_names=names, state_units=units, state_kinds=())
+    findings += _constant(demonstrations)
     remaining = list(range(len(demonstrations)))
     for look in (_lengths, _stills, _units, _duplicates, _jumps, _outliers):
         reported = [finding.among(remaining) for finding in look(demonstrations.rows(remaining))]
@@ -334,12 +342,14 @@ def _duplicates(demonstrations: Demonstrations) -> Iterator[Finding]:
     """Find copies by states and observed features."""
     paths, gaps = _paths(demonstrations), distances(demonstrations)
     usual = float(_pairs(gaps).median()) if len(paths) > 2 else 1.0
-    observed = [values.double().flatten(1) for values in demonstrations.observed.values()]
-    tolerances = [ALIKE * values.std(dim=0, correction=0) for values in observed]
+    observed = [values.flatten(1) for values in demonstrations.observed.values()]  # in double precision, images take 8 times more
+    tolerances = [
+        torch.cat([ALIKE * part.double().std(dim=0, correction=0) for part in values.split(BLOCK, dim=1)]) for values in observed
+    ]
 
     def differ(first: int, row: int) -> Iterator[bool]:
         for values, most in zip(observed, tolerances, strict=True):
-            yield bool(((values[first] - values[row]).abs() > most).any())
+            yield bool(((values[first].double() - values[row].double()).abs() > most).any())
 
     size = min(len(path) for path in paths) * paths[0].shape[1]
     limit = max(ALIKE * usual if size >= ENOUGH else 0.0, SAME)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ftl_lightning.data.features import Feature, InitialStates, Observed, check_whole, precise, take
+from ftl_lightning.data.kinds import KINDS
 from ftl_lightning.services.errors import UserError, about, require, short
 from ftl_lightning.services.files import MOST_RATIO, MOST_TENSORS, MOST_UNPACKED, raised, read_from, written_to
 from ftl_lightning.services.tensor_file import bytes_hash, serialise
@@ -65,6 +66,8 @@ def read_contents(path: str | Path) -> Contents:
     """Read attributes of demonstrations from a ``path`` as in :meth:`Demonstrations.load`, without validating them."""
     kind, name = read_from(str(path))
     contents = _format(kind, name).read(name)
+    foreign = next((text for text in contents["state_kinds"] if (text.split() or [KINDS[0]])[0] not in KINDS), "")
+    require(not foreign, f"{name}: key 'state_kinds'", f"one of {', '.join(KINDS)}", repr(short(foreign)))
     states, lengths = contents["states"], contents["lengths"]
     columns = states.shape[2] if states.dim() == 3 else 0
     require(columns <= MOST_COLUMNS, f"{name}: key 'states'", f"at most {MOST_COLUMNS} columns", columns)
@@ -438,6 +441,8 @@ def gathered(rows: NDArray[np.float64], lengths: NDArray[np.int64]) -> NDArray[n
     size, most = len(lengths) * int(lengths.max()) * rows.shape[1] * 8, raised(max(MOST_UNPACKED, MOST_RATIO * rows.nbytes))
     expected = f"padding to the longest, {lengths.max()}, within {most} bytes"
     require(size <= most, "lengths", expected, f"{size} bytes; cut long demonstrations or leave out short ones")
+    if (lengths == lengths[0]).all():
+        return rows.reshape(len(lengths), lengths[0], -1)
     times = np.minimum(np.arange(lengths.max()), lengths[:, None] - 1)
     return rows[(np.cumsum(lengths) - lengths)[:, None] + times]
 

@@ -26,6 +26,8 @@ COARSE = 1e-4
 """Maximum spacing of float32 at a column's largest number, as a share of the column's range; more needs float64."""
 LARGEST_WHOLE = 2**53
 """Largest whole number up to which float64 holds all."""
+BLOCK = 2**21
+"""Maximum number of states whose precision is examined at once."""
 SMOOTH = 0.8
 """Minimum correlation of neighbouring values of a column that moves rather than being noise."""
 
@@ -93,18 +95,26 @@ def precise(values: NDArray[Any], lengths: Sequence[int] | None = None) -> NDArr
         short_float = values.dtype.kind == "f" and values.dtype.itemsize <= 4
         if short_float or values.dtype.kind not in "fiu" or values.ndim < 2 or not values.size:
             return single
-        exact = np.asarray(values, dtype=np.float64).reshape(*(values.shape[:2] if values.ndim > 2 else (1, len(values))), -1)
-        valid = np.isfinite(exact)
-        if lengths is not None and len(lengths) == len(exact):
-            valid &= (np.arange(exact.shape[1]) < np.asarray(lengths)[:, None])[..., None]
-        low, high = np.where(valid, exact, np.inf).min(axis=1), np.where(valid, exact, -np.inf).max(axis=1)  # (demo, column)
-        size = np.where(valid, np.abs(exact), 0).max(axis=(0, 1), initial=0)
-        whole = high.max(axis=0, initial=-np.inf) - low.min(axis=0, initial=np.inf)
-        within = (high - low).max(axis=0, initial=0)
-        within = np.where(moves(exact, valid), within, whole)  # noise within demonstrations is no movement
-        noise = 0 if values.dtype.kind in "iu" else 1e-12 * size  # of a constant
-        coarse = (np.spacing(size.astype(np.float32)).astype(np.float64) > COARSE * within) & (within > noise)
-    return np.asarray(values, dtype=np.float64) if coarse.any() else single
+        columns = values.reshape(*(values.shape[:2] if values.ndim > 2 else (1, len(values))), -1)
+        each = max(BLOCK * columns.shape[2] // columns.size, 1)
+        parts = (columns[..., first : first + each] for first in range(0, columns.shape[2], each))  # for bounded memory
+        coarse = any(_coarse(part, lengths).any() for part in parts)
+    return np.asarray(values, dtype=np.float64) if coarse else single
+
+
+def _coarse(columns: NDArray[Any], lengths: Sequence[int] | None) -> NDArray[np.bool_]:
+    """Whether float32 cannot hold how each of ``columns`` ``(demo, time, column)`` varies within valid times."""
+    exact = np.asarray(columns, dtype=np.float64)
+    valid = np.isfinite(exact)
+    if lengths is not None and len(lengths) == len(exact):
+        valid &= (np.arange(exact.shape[1]) < np.asarray(lengths)[:, None])[..., None]
+    low, high = np.where(valid, exact, np.inf).min(axis=1), np.where(valid, exact, -np.inf).max(axis=1)  # (demo, column)
+    size = np.where(valid, np.abs(exact), 0).max(axis=(0, 1), initial=0)
+    whole = high.max(axis=0, initial=-np.inf) - low.min(axis=0, initial=np.inf)
+    within = (high - low).max(axis=0, initial=0)
+    within = np.where(moves(exact, valid), within, whole)  # noise within demonstrations is no movement
+    noise = 0 if columns.dtype.kind in "iu" else 1e-12 * size  # of a constant
+    return np.asarray((np.spacing(size.astype(np.float32)).astype(np.float64) > COARSE * within) & (within > noise))
 
 
 def moves(exact: NDArray[np.float64], valid: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -348,8 +348,8 @@ def _proposed(
     rest = every[:, first : first + free]
     if free >= 2 and (size := _one_hot(every, first, free)):
         return Group(CATEGORY, first, size, (size,))
-    rotations = [*_poses(first, free), Group(ROTATION, first, 9, (9,)), Group(QUATERNION, first, 4, _sign(paths, first))]
-    for group in (group for group in rotations if group.count <= free):
+    rotations = [*_poses(first, free), *([Group(ROTATION, first, 9, (9,))] if free >= 9 else [])]
+    for group in [*rotations, *([Group(QUATERNION, first, 4, _sign(paths, first))] if free >= 4 else [])]:
         if _shows(group, paths, names):
             place = f"{place}: column {short(names[first], 40)!r}"
             _require_valid(group, paths, place, advice="; mend it, or declare the columns linear (data.kinds, state_kinds)")
@@ -400,13 +400,14 @@ def _shows(group: Group, paths: Sequence[Tensor], names: Sequence[str]) -> bool:
 
 def wraps(columns: Sequence[Tensor], turn: float) -> bool:
     """Whether angles ``(time,)`` of demonstrations fill a turn, and jump from end to end in rare steps."""
-    values, steps = torch.cat(list(columns)), [column.diff().abs() for column in columns]
-    width, sizes = float(values.max() - values.min()) / turn, torch.cat(steps)
-    moving = sizes[sizes > 0]
-    jumps = [int((part > WRAPPED * turn).sum()) for part in steps]
-    if not TURN[0] <= width <= TURN[1] or not any(jumps):
+    values = torch.cat(list(columns))
+    if not TURN[0] <= float(values.max() - values.min()) / turn <= TURN[1]:
         return False
-    return sum(jumps) * RARE < len(moving) and float(sizes.max()) > 2 * RARE * float(moving.median())
+    within = torch.ones(len(values), dtype=torch.bool)
+    within[torch.tensor(list(map(len, columns))).cumsum(0) - 1] = False  # the last time of each
+    sizes = values.diff().abs()[within[:-1]]
+    moving, jumps = sizes[sizes > 0], int((sizes > WRAPPED * turn).sum())
+    return 0 < jumps * RARE < len(moving) and float(sizes.max()) > 2 * RARE * float(moving.median())
 
 
 def _turn(paths: Sequence[Tensor], column: int, turn: float) -> tuple[float, float, float]:

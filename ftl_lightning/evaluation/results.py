@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.evaluation.generation import Evaluable, TaskResult, demonstrations_of, paired, share
-from ftl_lightning.services.errors import UserError, about, short, shown
+from ftl_lightning.services.errors import UserError, about, require, short, shown
 from ftl_lightning.services.files import MOST_TEXT, check_readable
 from ftl_lightning.services.tensor_file import alone, atomic, content_hash, file_hash, visible
 from ftl_lightning.version import __version__
@@ -185,6 +185,8 @@ def reference_hash(configured: Mapping[str, Any]) -> str:
 
 FOLDER = r"\w[\w .+-]{0,99}"
 """Pattern of domain names, which are folder names in a report."""
+MOST_CELLS = 10_000
+"""Maximum number of cells in a row of a results file, for a fast refusal of other files."""
 LARGEST_WHOLE = 2**53
 """Maximum integer, including seeds."""
 COLUMNS = [field.name for field in fields(Row)]
@@ -303,6 +305,9 @@ def _table(file: Path, kinds: Any) -> "pd.DataFrame":
     import pandas as pd
 
     check_readable(file, "results", MOST_TEXT)
+    with file.open("rb") as lines:
+        most = max((line.count(b",") + 1 for line in lines), default=0)
+    require(most <= MOST_CELLS, "rows", f"at most {MOST_CELLS} cells in each", str(most))
     try:
         return pd.read_csv(file.absolute(), dtype=kinds, keep_default_na=False, compression=None)
     except (OSError, ValueError, OverflowError, MemoryError, csv.Error) as error:

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -152,3 +153,147 @@ def test_a_model_of_a_million_training_concepts_is_refused(capsys: Told) -> None
     config.write_text(json.dumps(json.loads(config.read_text()) | {"training_concepts": ["a"] * 10**6}))
     np.savez("five.npz", states=STATES, concepts="walk")
     refused(capsys, ["invert", "model", "five.npz"], "model/config.json", "training_concepts", "20000")
+
+
+HEAD = "demonstration,time,x\n"
+TABLES: dict[str, tuple[str, str]] = {
+    "decimal commas": (HEAD + '1,0,"0,5"\n1,1,"1,5"\n', "column 'x': expected numbers such as 1234.5, found '0,5'"),
+    "thousands": (HEAD + '1,0,"1,000.5"\n1,1,"2,000.5"\n', "column 'x': expected numbers such as 1234.5"),
+    "semicolons": ("demonstration;x;y\n1;0,5;2\n1;1,5;3\n", "line 1: expected commas between names, found ';'"),
+    "tabs": ("demonstration\tx\n1\t0.5\n1\t1.5\n", "line 1: expected commas between names"),
+    "texts and numbers": (HEAD + "1,1,2\n1,2,a\n", "column 'x': expected numbers, found 'a' in row 2"),
+    "many texts": ("\n".join(",".join(f"a{row}x{column}" for column in range(1500)) for row in range(700)), "columns of numbers"),
+}
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_a_table_of_other_marks_or_many_texts_is_refused_at_once(name: str, capsys: Told) -> None:
+    text, expected = TABLES[name]
+    Path("x.csv").write_text(text)
+    begin = time.process_time()
+    refused(capsys, ["check", "x.csv"], "x.csv", expected)
+    assert time.process_time() - begin < 5
+
+
+def test_texts_with_commas_are_still_left_out_with_a_note(capsys: Told) -> None:
+    rows = "".join(f'1,{time},{time}.5,"left, then {time}"\n' for time in range(9))
+    Path("x.csv").write_text("demonstration,time,x,remark\n" + rows)
+    succeed("check", "x.csv")
+    assert "column 'remark' is not read, as it holds no numbers" in capsys.readouterr().err
+
+
+def test_precision_is_that_of_all_columns_of_a_large_array(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Columns are examined in blocks."""
+    from ftl_lightning.data import features
+
+    values = np.cumsum(np.random.default_rng(0).normal(size=(2, 50, 7)), axis=1)
+    far = values + np.where(np.arange(7) == 6, 5.8e7, 0)
+    for block in (10**9, 300, 1):
+        monkeypatch.setattr(features, "BLOCK", block)
+        assert features.precise(values).dtype == np.float32
+        assert features.precise(far).dtype == np.float64
+
+
+def _deep(file: Any, depth: int) -> None:
+    import h5py
+
+    group = file.id
+    for _ in range(depth):
+        group = h5py.h5g.create(group, b"g")
+
+
+@pytest.mark.parametrize("kind", ["groups", "arrays", "deep"])
+def test_an_hdf5_file_of_many_or_deep_groups_is_refused(kind: str, capsys: Told) -> None:
+    h5py = pytest.importorskip("h5py")
+    with h5py.File("x.h5", "w") as file:
+        file["states"] = STATES
+        for number in range(2500 if kind != "deep" else 0):
+            file.create_group(f"g{number}") if kind == "groups" else file.create_dataset(f"observed/{number}", data=[1.0])
+        if kind == "deep":
+            _deep(file, 5000)
+    refused(capsys, ["check", "x.h5"], "x.h5", "at most 40 deep" if kind == "deep" else "at most 2000 groups and arrays")
+
+
+LISTED: dict[str, object] = {
+    "number": [torch.ones(4, 2), 3],
+    "text": [torch.ones(4, 2), "a"],
+    "nothing": [torch.ones(4, 2), None],
+    "flat": [torch.ones(4, 2), torch.ones(3)],
+    "single numbers": [torch.tensor(1.0), torch.tensor([2.0])],
+}
+
+
+@pytest.mark.parametrize("name", LISTED)
+def test_a_list_of_tensors_and_others_is_one_line(name: str, capsys: Told) -> None:
+    torch.save(LISTED[name], "x.pt")
+    refused(capsys, ["check", "x.pt"], "x.pt: key 'states'", "expected")
+
+
+@pytest.mark.parametrize("key", ["states", "unread"])
+def test_a_list_that_stands_for_many_is_refused(key: str, capsys: Told) -> None:
+    listed: list[object] = [1.0] * 10
+    for _ in range(9):
+        listed = [listed] * 10
+    torch.save({"states": torch.from_numpy(STATES), key: listed}, "x.pt")
+    refused(capsys, ["check", "x.pt"], "x.pt: content: expected at most", "found more")
+
+
+def test_wide_states_are_checked_in_part(capsys: Told) -> None:
+    states = np.random.default_rng(0).normal(size=(3, 12, 1200)).cumsum(axis=1)
+    np.savez("x.npz", states=states, concepts="walk")
+    succeed("check", "x.npz")
+    assert "the first 1000 of 1200 columns are checked" in capsys.readouterr().out
+
+
+def test_a_kind_that_is_unknown_is_refused_by_check_too(capsys: Told) -> None:
+    np.savez("x.npz", states=STATES, state_kinds=["linear", "foo"])
+    refused(capsys, ["check", "x.npz"], "x.npz: key 'state_kinds': expected one of linear, angle", "'foo'")
+
+
+def test_a_minari_space_of_many_parts_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Told) -> None:
+    pytest.importorskip("minari")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "sets"))
+    Demonstrations.of(list(STATES), "a").save("minari:robot-v0")
+    path = tmp_path / "sets" / "robot-v0" / "data" / "metadata.json"
+    box = {"type": "Box", "dtype": "float32", "shape": [1], "low": [0], "high": [1]}
+    flat = {"type": "Tuple", "subspaces": [box] * 3000}
+    deep = {"type": "Tuple", "subspaces": [{"type": "Tuple", "subspaces": [box] * 1000}] * 3}
+    for space in (flat, deep):
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"observation_space": json.dumps(space)}))
+        refused(capsys, ["check", "robot-v0"], "robot-v0: key 'observation_space.subspaces': expected at most 2000")
+
+
+@pytest.mark.parametrize("text", [b"," * 10**6, b"domain,task\n" + b"," * 10**6])
+def test_results_of_endless_cells_are_refused(text: bytes, capsys: Told) -> None:
+    Path("x.csv").write_bytes(text)
+    expected = "x.csv: rows: expected at most 10000 cells in each, found 1000001"
+    refused(capsys, ["report", "--results", "x.csv", "--out", "out"], expected)
+
+
+def test_a_listing_of_too_many_films_is_refused(capsys: Told) -> None:
+    Path("films").mkdir()
+    Path("films/films.json").write_text(json.dumps([{"concept": "a", "method": "m", "file": "x"}] * 20_000))
+    arguments = ["study", "mocap", "--films", "films", "--out", "out"]
+    refused(capsys, arguments, "films.json: films: expected at most 10000, found 20000")
+
+
+STAGE = {"verb": "invert", "config": "conf/agent.yaml"}
+PLANS: dict[str, tuple[dict[str, object], str]] = {
+    "no stages": ({"stages": []}, "stages: expected one or more, found none"),
+    "cells": ({"stages": [STAGE | {"grid": {f"model.x{number}": list(range(100)) for number in range(4)}}]}, "20000 cells"),
+    "each": ({"stages": [STAGE | {"each": {f"x{number}": ["a"] * 100 for number in range(4)}}]}, "20000 cells"),
+    "unknown": (
+        {"stages": [STAGE | {"options": {"model.output": "x/{nothing}"}}]},
+        "placeholders among {seed}, found {nothing}",
+    ),
+    "attribute": ({"stages": [STAGE | {"name": "{seed.__class__}"}]}, "found {seed.__class__}"),
+    "format": ({"stages": [STAGE | {"done": "{seed:03d}"}]}, "found {seed:03d}"),
+    "in the file": ({"stages": [STAGE | {"config": "conf/{domain}.yaml"}]}, "found {domain}"),
+}
+
+
+@pytest.mark.parametrize("name", PLANS)
+def test_a_plan_of_endless_cells_or_unknown_placeholders_is_refused(name: str, capsys: Told) -> None:
+    content, expected = PLANS[name]
+    Path("plan.yaml").write_text(json.dumps(content | {"results": "r.csv"}))
+    refused(capsys, ["ablate", "--config", "plan.yaml", "--status=true"], expected)

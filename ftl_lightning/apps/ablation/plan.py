@@ -14,6 +14,9 @@ from ftl_lightning.services.errors import UserError, require, short
 
 CPUS, GPUS, MEMORY = "cpus", "gpus", "memory_gb"  #: Resources of every cluster; others are custom resources of Ray.
 GIGABYTE = 10**9
+MOST_CELLS = 20_000
+"""Maximum number of cells of a stage and a seed."""
+_PLACEHOLDER = re.compile(r"\{(\w[^{}\"',\s]*)\}")
 _NAME = re.compile(r"[A-Za-z][\w.-]{0,63}")
 
 
@@ -127,6 +130,8 @@ class Stage:
         if self.seeds and seed not in self.seeds:
             return
         require(self.config, "config", "a configuration file or a list of them", "none")
+        count = math.prod(map(len, (*self.each.values(), *self.grid.values())))
+        require(count <= MOST_CELLS, "stages", f"at most {MOST_CELLS} cells of a stage and a seed", str(count))
         files = [self.config] if isinstance(self.config, str) else self.config
         for texts in itertools.product(*self.each.values()):
             names = {"seed": str(seed), **dict(zip(self.each, texts, strict=True))}
@@ -143,11 +148,12 @@ class Stage:
 
 
 def _filled(value: Any, names: Mapping[str, str]) -> str:
-    """Text of a value, with placeholders replaced."""
+    """Text of a value, with placeholders replaced. Raise UserError for an unknown placeholder."""
     text = value if isinstance(value, str) else json.dumps(value)
-    for name, replacement in names.items():
-        text = text.replace(f"{{{name}}}", replacement)
-    return text
+    for name in _PLACEHOLDER.findall(text):
+        known = ", ".join(f"{{{known}}}" for known in names)
+        require(name in names, f"stages: {short(text)!r}", f"placeholders among {short(known, 80)}", f"{{{short(name)}}}")
+    return _PLACEHOLDER.sub(lambda match: names[match[1]], text)
 
 
 def part(plan: Sequence[Sequence[Cell]], shard: str) -> list[list[Cell]]:

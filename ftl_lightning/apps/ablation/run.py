@@ -29,6 +29,10 @@ if TYPE_CHECKING:
     from ftl_lightning.training.adaptation import Adaptation
 
 
+MOST_SEEDS = 1000
+"""Maximum number of seeds of an ablation."""
+
+
 def check(cells: Sequence[Cell]) -> None:
     """Check files, keys and encoder of each cell and, for ``invert``, domain, suites and model, before any cell starts. Raise
     UserError with all mistakes.
@@ -145,7 +149,9 @@ def planned(stages: Sequence[Stage], seeds: Sequence[int], root: str = "", only:
     Raises:
         UserError: without seeds, or for a number that is no stage.
     """
+    require(stages, "stages", "one or more", "none")
     require(seeds, "seeds", "one or more", "none")
+    require(len(seeds) <= MOST_SEEDS, "seeds", f"at most {MOST_SEEDS}", str(len(seeds)))
     for number in only:
         require(1 <= number <= len(stages), "only", f"numbers of stages from 1 to {len(stages)}", number)
     shared = {"data.root": root} if root else {}

@@ -20,6 +20,7 @@ from ftl_lightning.services.text import line
 from ftl_lightning.services.validation import from_mapping, read_json
 
 LISTING = "films.json"
+MOST_FILMS = 10_000  #: Maximum number of films of a listing.
 TRAINING, NEW = "training", "new"  #: Settings: concepts of pretraining, and new concepts.
 CHECKS = {"check-yes": "yes", "check-no": "no"}  #: Pseudo-methods of films with an obvious answer, and that answer.
 YES, NO = "yes", "no"
@@ -125,6 +126,7 @@ def _listed(path: Path) -> list[ListedFilm]:
     content = read_json(path)
     with about(path):
         require(isinstance(content, list) and content, "films", "a list with one or more films", content)
+        require(len(content) <= MOST_FILMS, "films", f"at most {MOST_FILMS}", len(content))
         return [from_mapping(ListedFilm, entry, f"films[{number}]") for number, entry in enumerate(content)]
 
 

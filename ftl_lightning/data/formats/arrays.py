@@ -32,12 +32,12 @@ from numpy.typing import NDArray
 
 from ftl_lightning.data.demonstrations import FORMATS, OBSERVED, Contents, Demonstrations, Format, gathered, stacked
 from ftl_lightning.data.features import check_single, check_whole, precise
-from ftl_lightning.data.formats.files import DAMAGED, TEXTS, check_array, check_arrays, contents_of, write_npz
+from ftl_lightning.data.formats.files import DAMAGED, MOST_ARRAYS, TEXTS, check_array, check_arrays, contents_of, write_npz
 from ftl_lightning.data.formats.matlab import check_matlab
 from ftl_lightning.services.errors import UserError, about, note, require, short
 from ftl_lightning.services.files import MOST_HEADER, MOST_TENSORS, check_readable, check_unpacked, raised
 from ftl_lightning.services.shipped import check_extra
-from ftl_lightning.services.validation import read_json
+from ftl_lightning.services.validation import MOST_LISTS, MOST_VALUES, read_json
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -57,6 +57,8 @@ MOST_NOTES = 5
 """Maximum number of arrays or columns that are noted by name."""
 MOST_COLUMNS = 2000
 """Maximum number of columns of a table."""
+MOST_TEXTS = 100_000
+"""Maximum number of texts of a table in which numbers are looked for."""
 CELL = 1000
 """Bytes of a cell of MATLAB in memory."""
 _LABELS = re.compile(r"(per_step|observed|observations?|obs)([/_.].*)?[/_.](names|units|kinds)([/_.].*)?", re.IGNORECASE)
@@ -147,7 +149,9 @@ def _check_null(array: NDArray[Any], timed: bool) -> None:
 
 def _null(value: Any) -> tuple[int, ...] | None:
     """Index of the first missing value in nested lists."""
-    if isinstance(value, list | np.ndarray):
+    if isinstance(value, np.ndarray):
+        return _null(value.tolist()) if value.dtype.kind == "O" else None
+    if isinstance(value, list):
         return next(((index, *found) for index, part in enumerate(value) if (found := _null(part)) is not None), None)
     return () if value is None else None
 
@@ -335,7 +339,7 @@ def _hdf5(path: Path, size: int) -> Arrays:
     from ftl_lightning.data.formats.hdf5_file import opened, read_array
 
     names: list[str] = []
-    with opened(path) as file:
+    with opened(path, MOST_ARRAYS) as file:
         file.visit(names.append)
         items = {name: file[name] for name in names}
         return {
@@ -353,8 +357,20 @@ def _torch(path: Path, size: int) -> Arrays:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except UnpicklingError as error:
         raise UserError("expected tensors, numbers and texts, found other objects, which are never read; save tensors") from error
+    _check_listed(content)
     check_unpacked(sum(tensor.numel() * tensor.element_size() for tensor in _tensors(content)), size, "tensors")
     return _by_name(content)
+
+
+def _check_listed(content: Any) -> None:
+    """Refuse more mappings, lists and values than a JSON text may hold; a list that is stored once may stand for many."""
+    lists, values, rest = 0, 0, [content] if isinstance(content, dict | list | tuple) else []
+    while rest:
+        part = rest.pop()
+        lists, values = lists + 1, values + len(part)
+        require(lists <= MOST_LISTS, "content", f"at most {MOST_LISTS} lists and mappings", "more")
+        require(values <= MOST_VALUES, "content", f"at most {MOST_VALUES} values", "more")
+        rest += [value for value in (part.values() if isinstance(part, dict) else part) if isinstance(value, dict | list | tuple)]
 
 
 def _tensors(content: Any) -> Iterator[torch.Tensor]:
@@ -370,7 +386,15 @@ def _csv(path: Path, size: int) -> Arrays:
     import pandas as pd
 
     with path.open("rb") as file:
-        most = max((line.count(b",") for line in file), default=0)
+        names = file.readline(MOST_HEADER)
+        other = next((mark for mark in (";", "\t") if mark.encode() in names and b"," not in names), None)
+        found = f"{other!r}; convert it in Python: pandas.read_csv(FILE, sep={other!r}).to_csv(NEW, index=False)"
+        require(other is None, "line 1", "commas between names", found)
+        file.seek(0)
+        most = 0
+        for line in iter(partial(file.readline, MOST_HEADER), b""):
+            require(len(line) < MOST_HEADER, "lines", f"less than {MOST_HEADER} bytes in each", "more")
+            most = max(most, line.count(b","))
     require(most < MOST_COLUMNS, "columns", f"at most {MOST_COLUMNS}", str(most + 1))
     table = pd.read_csv(path.absolute(), compression=None, low_memory=False)
     require(
@@ -413,6 +437,7 @@ def _of_table(table: "pd.DataFrame", path: Path) -> Arrays:
         next((columns[name] for name in names if name in columns), None) for names in (EPISODE, TIME, CONCEPT)
     )
     numeric, notes, dtypes = [], set(), dict(table.dtypes)
+    look = MOST_TEXTS // max(sum(dtype.kind == "O" for dtype in dtypes.values()), 1) + 1
     for name in table.columns:
         plain = str(name).strip().lower()
         if name in (episode, time, concept):
@@ -422,15 +447,13 @@ def _of_table(table: "pd.DataFrame", path: Path) -> Arrays:
         elif dtypes[name].kind in "fiub":
             numeric.append(name)
         else:
-            missing = pd.to_numeric(table[name], errors="coerce").isna().to_numpy()
-            row = int(missing.argmax())
-            found = f"{short(str(table[name].iloc[row]))!r} in row {rows[row]}"
-            require(missing.all(), f"column {short(str(name))!r}", "numbers", found)
+            _check_texts(table[name], rows, look)
             notes.add(f"column {short(str(name))!r} is not read, as it holds no numbers")
     require(numeric, "columns", "columns of numbers, the columns of a state", short(", ".join(map(str, columns))))
     for name in numeric:
         check_whole(f"column {short(str(name))!r}", table[name].to_numpy())
     numbers = table[numeric].to_numpy(dtype=np.float64)
+    table = table[[name for name in table.columns if name in (episode, time, concept)]]
     for row, column in np.argwhere(~np.isfinite(numbers))[:1]:
         place = f"column {short(str(numeric[column]))!r}"
         raise UserError(f"{place}: expected finite numbers, found {numbers[row, column]} in row {rows[row]}")
@@ -458,7 +481,9 @@ def _of_table(table: "pd.DataFrame", path: Path) -> Arrays:
     require(not found, f"column {time!r}", "another time in each row of a demonstration", f"{found}; is {EPISODE[0]!r} missing?")
     lengths = np.bincount(codes)
     firsts = order[np.cumsum(lengths) - lengths]
-    arrays: Arrays = {"states": gathered(numbers[order], lengths), "lengths": lengths}
+    if (np.diff(order) < 0).any():
+        numbers = numbers[order]
+    arrays: Arrays = {"states": gathered(numbers, lengths), "lengths": lengths}
     arrays["state_names"] = np.array([str(name) for name in numeric], dtype=object)
     if concept is not None:
         kinds, different = pd.factorize(table[concept])
@@ -469,6 +494,23 @@ def _of_table(table: "pd.DataFrame", path: Path) -> Arrays:
         arrays["concepts"] = np.array([texts[kind] for kind in kinds[firsts]], dtype=object)
     _note_unread(str(path), notes)
     return arrays
+
+
+def _check_texts(column: "pd.Series", rows: NDArray[Any], look: int) -> None:
+    """Refuse a column of numbers and texts, or of numbers with commas; ``UserError`` with its name and the first such row.
+
+    Args:
+        column: texts, or values of several types.
+        rows: number of each row, for messages.
+        look: number of values to examine.
+    """
+    place, first = f"column {short(str(column.name))!r}", [str(value) for value in column.dropna().iloc[:look]]
+    if any(map(_is_number, first)):
+        row = next((row for row, value in enumerate(column) if not _is_number(str(value))), 0)
+        raise UserError(f"{place}: expected numbers, found {short(str(column.iloc[row]))!r} in row {rows[row]}")
+    if first and all(_is_number(text.replace(",", "")) for text in first):
+        found = f"{short(first[0])!r}; write a point before decimals, no other marks"
+        raise UserError(f"{place}: expected numbers such as 1234.5, found {found}")
 
 
 def _not_written(demonstrations: Demonstrations, name: str) -> None:

@@ -30,7 +30,7 @@ TEXTS = ("state_names", "state_units", "state_kinds", "concepts", "per_step")
 MOST_SHRUNK = 1032
 """Maximum compression ratio of zlib."""
 MOST_ARRAYS = 2000
-"""Maximum number of arrays in an ``.npz`` file."""
+"""Maximum number of arrays in an ``.npz`` file, and of groups and arrays in an HDF5 file."""
 SLOW = 20
 """Minimum number of demonstrations for progress lines without a terminal."""
 DAMAGED = (

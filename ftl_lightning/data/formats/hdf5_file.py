@@ -12,27 +12,28 @@ from numpy.typing import NDArray
 
 from ftl_lightning.services.errors import UserError, require, short
 from ftl_lightning.services.files import MOST_HEADER, MOST_UNPACKED, check_readable, check_unpacked, raised
+from ftl_lightning.services.validation import DEEPEST
 
 MOST_OBJECTS = 2_000_000
 """Maximum number of groups and arrays in a file; scaled by :func:`~ftl_lightning.services.files.raised`."""
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[h5py.File]:
-    """Open a file whose content lies in the file itself, each object under a single name.
+def opened(path: Path, most: int = MOST_OBJECTS) -> Iterator[h5py.File]:
+    """Open a file of at most ``most`` groups and arrays whose content lies in the file itself, each object under a single name.
 
     Raises:
         OSError, RuntimeError, ValueError: of h5py, for a damaged file.
-        UserError: naming the file, if it is missing or much larger when unpacked; naming the object, for soft and external links, a
-            second name, which may close a circle, external storage and virtual data sets.
+        UserError: naming the file, if it is missing, much larger when unpacked, too deep or of too many objects; naming the object,
+            for soft and external links, a second name, which may close a circle, external storage and virtual data sets.
     """
     packed = check_readable(path, "HDF5")
     with h5py.File(path, "r") as file:
-        check_unpacked(_checked_size(file), packed, "arrays")
+        check_unpacked(_checked_size(file, most), packed, "arrays")
         yield file
 
 
-def _checked_size(file: h5py.File) -> int:
+def _checked_size(file: h5py.File, most: int) -> int:
     """Unpacked bytes of all arrays; texts and arrays of variable length count as their references."""
     names: list[bytes] = []
     known = {h5py.h5o.get_info(file.id).addr}
@@ -42,8 +43,10 @@ def _checked_size(file: h5py.File) -> int:
             return f"{_shown(name)}: expected data of this file, found a link to another place or file"
         if link.u in known:
             return f"{_shown(name)}: expected an object of a single name, found another name of an object that has one"
-        if len(names) >= raised(MOST_OBJECTS):
-            return f"content: expected at most {raised(MOST_OBJECTS)} groups and arrays, found more"
+        if len(names) >= raised(most):
+            return f"content: expected at most {raised(most)} groups and arrays, found more"
+        if name.count(b"/") >= DEEPEST:  # HDF5 crashes at groups that are too deep
+            return f"content: expected groups at most {DEEPEST} deep, found deeper ones"
         known.add(link.u)
         names.append(name)
         return None

@@ -33,6 +33,8 @@ from ftl_lightning.services.validation import LARGEST, check_json_size, check_ty
 
 CONCEPT, SCENE = "concept", "scene"
 """Keys of an episode's text and scene, see this module."""
+MOST_PARTS = 2000
+"""Maximum number of parts of an observation or an action."""
 _HEADER = "ftl_lightning"  # metadata key of attributes that only write_minari knows
 _DAMAGED = (
     *(ImportError, OSError, ValueError, KeyError, TypeError, AttributeError, AssertionError, NotImplementedError),
@@ -116,14 +118,18 @@ def _check_metadata(folder: Path) -> None:
     require(all(str(number) in numbers for number in range(episodes)), "total_episodes", "a folder for each", str(episodes))
 
 
-def _check_space(space: Any, key: str) -> None:
-    """Refuse a space of many numbers, whose limits Minari makes."""
+def _check_space(space: Any, key: str) -> int:
+    """Number of parts of a space; refuse one of many parts or numbers, whose limits Minari makes."""
     space = check_type(space, Mapping[str, Any], key)
     shape: tuple[int, ...] = check_type(space.get("shape", []), tuple[int, ...], f"{key}.shape")
     require(prod(shape) <= LARGEST, f"key '{key}.shape'", f"at most {LARGEST} numbers", shown(shape))
     inner = space.get("subspaces", [])
-    for part in inner.values() if isinstance(inner, Mapping) else inner:
-        _check_space(part, key)
+    count = len(inner) if isinstance(inner, Mapping | list) else 0
+    require(count <= MOST_PARTS, f"key '{key}.subspaces'", f"at most {MOST_PARTS}", str(count))
+    for part in (inner.values() if isinstance(inner, Mapping) else inner) if count else ():
+        count += _check_space(part, key)
+        require(count <= MOST_PARTS, f"key '{key}.subspaces'", f"at most {MOST_PARTS}", "more")
+    return count
 
 
 @dataclass(frozen=True)
