@@ -111,6 +111,7 @@ class Inversion(nn.Module):
 
     Args:
         model, demonstrations, settings: see :func:`invert`.
+        by_sample: see :func:`~ftl_lightning.igm.forms.adapter.adaptable`.
 
     Attributes:
         embeddings: parameter ``(run, K, knots, n)``; a component has one embedding at each of ``knots`` times of the plan.
@@ -131,7 +132,9 @@ class Inversion(nn.Module):
     is_mode: Tensor
     kept: Tensor
 
-    def __init__(self, model: Invertible, demonstrations: Demonstrations, settings: InversionSettings) -> None:
+    def __init__(
+        self, model: Invertible, demonstrations: Demonstrations, settings: InversionSettings, by_sample: bool = False
+    ) -> None:
         super().__init__()
         model.check_settings(settings)
         object.__setattr__(self, "model", model)  # not registered as a submodule
@@ -152,7 +155,7 @@ class Inversion(nn.Module):
             self.weights = nn.Parameter(torch.full(shape, float(settings.weights.initial)))
         else:
             self.register_buffer("weights", torch.full(shape, float(settings.omega)), persistent=False)
-        sizes = model.adaptable() if settings.adapter.rank else {}
+        sizes = model.adaptable(by_sample) if settings.adapter.rank else {}
         self._adapted = list(sizes)
         self.factors = self._initial_factors(list(sizes.values()), draws)
         tolerance = settings.budget.tolerance

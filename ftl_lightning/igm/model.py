@@ -62,8 +62,8 @@ class Invertible(Protocol):
     def check_settings(self, settings: InversionSettings) -> None:
         """Raise ``UserError`` for settings that the model does not support."""
 
-    def adaptable(self) -> Mapping[str, tuple[int, int]]:
-        """Sizes ``(outputs, inputs)`` of the weights that an adapter can modify, by parameter name."""
+    def adaptable(self, by_sample: bool = False) -> Mapping[str, tuple[int, int]]:
+        """Sizes of the weights that an adapter can modify, see :func:`~ftl_lightning.igm.forms.adapter.adaptable`."""
 
     def draws(self, samples: int, timestep_power: float, draw: torch.Generator) -> Draws | None:
         """Draw the timesteps and noise of :meth:`losses` for ``samples`` windows; ``None`` for a loss without noise."""

@@ -280,7 +280,7 @@ class ConceptModel(Shown, nn.Module, ABC):
         training = zip(self.config.training_concepts, self.training_embeddings, strict=True)
         return [Point("(empty)", EMPTY_CONCEPT, self.empty), *(Point(text, TRAINING_CONCEPT, each) for text, each in training)]
 
-    def adaptable(self) -> dict[str, tuple[int, int]]:
+    def adaptable(self, by_sample: bool = False) -> dict[str, tuple[int, int]]:
         """Weights that an adapter can change, see :func:`ftl_lightning.igm.forms.adapter.adaptable`; none without adapters."""
         return {}
 

@@ -83,13 +83,14 @@ class LowRank:
 KINDS = ("up", "down")
 
 
-def adaptable(network: nn.Module) -> dict[str, tuple[int, int]]:
-    """Sizes ``(outputs, everything else)`` of the weights that an adapter modifies, by name.
+def adaptable(network: nn.Module, by_sample: bool = False) -> dict[str, tuple[int, int]]:
+    """Sizes ``(outputs, everything else)`` of the weights that an adapter can modify, by name: all matrices and convolutions.
 
-    These are the matrices of the network's layers for each sample, if it names them in ``by_sample``, so that adapters are applied
-    together (:func:`adapted`); otherwise all matrices and convolutions.
+    Args:
+        by_sample: only the layers that the network names in ``by_sample``, whose rows are the samples of a batch, if it names any:
+            adapters of these are applied together (:func:`adapted`).
     """
-    layers = _by_sample(network)
+    layers = _by_sample(network) if by_sample else set()
     weights = {name: weight for name, weight in network.named_parameters() if weight.dim() > 1}
     return {name: (len(weight), weight[0].numel()) for name, weight in weights.items() if not layers or name in layers}
 

@@ -116,13 +116,15 @@ def _adapted(
     steps: int,
     mixed: bool,
     tell: Tell,
-    most: int = ADAPTER_STEPS,
+    by_sample: bool = False,
 ) -> dict[str, Concept]:
     """Concepts of one set and an adapter; with ``mixed``, of mixtures that share an adapter (several demonstrations only)."""
     adapter = settings.adapter
     rank, rate = (adapter.rank, adapter.learning_rate) if adapter.rank else (RANK, RATE)
     changes = {"modes": "each" if mixed else 1, "adapter": rank, "adapter_learning_rate": rate, "tolerance": None}
-    concepts = invert(model, demonstrations, settings.from_one_start(form=PAPER, **changes), min(steps, most), tell)
+    one, most = settings.from_one_start(form=PAPER, **changes), SKILLED_STEPS if by_sample else ADAPTER_STEPS
+    start = Inversion(model, demonstrations, one, by_sample).to(model.device)
+    concepts = invert(model, demonstrations, one, min(steps, most), tell, start=start)
     for name, concept in concepts.items():
         if concept.modes:
             modes = replace(concept.modes, mixed=True, stretch=even_stretch(len(concept.modes)))
@@ -180,7 +182,7 @@ def by_skill(
     sets = learned_from(model, demonstrations, _rows_of(len(demonstrations), left.rows), quickly(settings), steps, tell)
     scores[ONE] = left.score([sets.row(fold) for fold in range(len(parts))], seed)
     labelled = concatenate([replace(part, concepts=(f"{fold}",) * len(part)) for fold, part in enumerate([demonstrations, *parts])])
-    adapted, *without = _adapted(model, labelled, settings.changed(**SKILLED), steps, False, tell, SKILLED_STEPS).values()
+    adapted, *without = _adapted(model, labelled, settings.changed(**SKILLED), steps, False, tell, by_sample=True).values()
     whole[ADAPTED] = replace(adapted, origin=replace(first.origin, loss=adapted.origin.loss))
     scores[ADAPTED] = left.score([concept.composition for concept in without], seed)
     if len(demonstrations) > 2:

@@ -94,8 +94,8 @@ class GenerativeModel(DiffusionModel, TextConceptModel):
         over_time: bool = getattr(networks, self.config.denoiser).over_time
         return over_time
 
-    def adaptable(self) -> dict[str, tuple[int, int]]:
-        return adaptable(self.denoiser)
+    def adaptable(self, by_sample: bool = False) -> dict[str, tuple[int, int]]:
+        return adaptable(self.denoiser, by_sample)
 
     def check_adapter(self, adapter: LowRank) -> None:
         adapter.check_fits(self.denoiser)
