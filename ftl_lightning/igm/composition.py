@@ -34,7 +34,7 @@ class Maker(Protocol):
         """Name of the form."""
 
     def sample(self, observed: Mapping[str, Tensor], count: int, draw: torch.Generator, /) -> Tensor:
-        """Samples ``(count, horizon, state)`` in the domain's units for observed features ``(count, ...)``."""
+        """Samples ``(count, horizon, state)`` in the domain's units for ``observed`` features ``(count, ...)``, by ``draw``."""
 
 
 def space_of(domain: str, model_hash: str) -> str:

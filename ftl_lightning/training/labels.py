@@ -4,10 +4,13 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from ftl_lightning.domains.comparison import CHOSEN, FINE_TUNED, WITH_ADAPTER, WITH_MODES
-from ftl_lightning.igm.settings import ADAPTED, AUTO, MIXED, MODES, InversionSettings
+from ftl_lightning.igm.settings import ADAPTED, AUTO, COMBINED, MIXED, MODES, NOT_LEARNED, InversionSettings
 from ftl_lightning.training.method import Method
 
-FORMS = {AUTO: CHOSEN, MODES: WITH_MODES, ADAPTED: WITH_ADAPTER, MIXED: f"{WITH_MODES} {WITH_ADAPTER}"}
+FORMS = {
+    **{AUTO: CHOSEN, MODES: WITH_MODES, ADAPTED: WITH_ADAPTER, MIXED: f"{WITH_MODES} {WITH_ADAPTER}", COMBINED: COMBINED},
+    **{form: f"{form}, not learned" for form in NOT_LEARNED},
+}
 """Names in tables of forms that override modes and adapter."""
 
 
