@@ -43,7 +43,8 @@ class PathFeatures:
         kernels = kernels * (torch.rand(KERNELS, state, 1, generator=draw) < max(2 / state, 0.3))
         self.kernels = kernels / kernels.flatten(1).norm(dim=1).clamp(min=1e-6)[:, None, None]
         most = math.log2(max((horizon - 1) / max(width - 1, 1), 1))
-        self.dilations = (2 ** (most * torch.rand(KERNELS, generator=draw))).long().tolist()
+        dilations = (2 ** (most * torch.rand(KERNELS, generator=draw))).long()
+        self.dilations = {int(dilation): dilations == dilation for dilation in dilations.unique()}
         some = torch.randperm(len(real), generator=draw)[:PAIRED]
         self.units = [_mean_distance(values) for values in self(real[some])]
 
@@ -53,15 +54,16 @@ class PathFeatures:
         if paths.shape[1] < 3:
             return [scaled.flatten(1)]
         convolved = []
-        for kernel, dilation in zip(self.kernels, self.dilations, strict=True):
-            values = functional.conv1d(scaled.transpose(1, 2), kernel[None], dilation=dilation)[:, 0]
-            convolved += [values.amax(dim=1), values.amin(dim=1), (values > 0).float().mean(dim=1), values.std(dim=1, correction=0)]
+        for dilation, chosen in self.dilations.items():
+            values = functional.conv1d(scaled.transpose(1, 2), self.kernels[chosen], dilation=dilation)
+            parts = (values.amax(dim=2), values.amin(dim=2), (values > 0).float().mean(dim=2), values.std(dim=2, correction=0))
+            convolved += list(parts)
         amplitudes = torch.fft.rfft(scaled - scaled.mean(dim=1, keepdim=True), dim=1).abs()
         quiet = QUIET * paths.shape[1] ** 0.5
         return [
             scaled.flatten(1),
             scaled.diff(dim=1).flatten(1),
-            torch.stack(convolved, dim=1),
+            torch.cat(convolved, dim=1),
             (amplitudes + quiet).log().flatten(1),
         ]
 

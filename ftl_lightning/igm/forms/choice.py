@@ -23,7 +23,7 @@ from ftl_lightning.services.errors import UserError
 
 RANK, RATE, ADAPTER_STEPS = 1, 3e-3, 120
 """Default rank, learning rate and steps of adapters."""
-SKILLED: Mapping[str, Any] = {"adapter": 8, "adapter_learning_rate": 6e-3, "components": 1, "omega": 1.0}
+SKILLED: Mapping[str, Any] = {"adapter": 8, "adapter_learning_rate": 6e-3, "components": 1, "omega": 1.0, "samples": 16}
 SKILLED_STEPS = 200
 """Settings of the adapter that :func:`by_skill` learns, and steps of the adapter and of modes."""
 SIMPLEST = (COMBINED, ONE, ADAPTED, MODES)

@@ -20,8 +20,8 @@ SAMPLES = 64
 """Noised windows of each demonstration."""
 PENALTIES = (0.3, 0.1, 0.03, 0.01)
 """L1 penalties relative to the smallest that makes all weights 0, the largest first."""
-ITERATIONS = 1000
-"""Steps of the proximal gradient method."""
+ITERATIONS, CONVERGED = 1000, 1e-6
+"""Maximum number of steps of the proximal gradient method, and largest change of a step, relative to the weights, that ends it."""
 LEAST = 1e-3
 """Smallest weight of a combination, relative to the largest."""
 
@@ -108,6 +108,9 @@ def _minimum(products: Tensor, penalty: float) -> Tensor:
     for _ in range(ITERATIONS):
         moved = ahead + step * (b - torch.einsum("pij,pj->pi", a, ahead))
         new = moved.sign() * (moved.abs() - threshold).clamp(min=0)
+        if float((new - weights).abs().max()) <= CONVERGED * float(new.abs().max()):
+            weights = new
+            break
         following = (1 + (1 + 4 * momentum**2) ** 0.5) / 2
         ahead, weights, momentum = new + (momentum - 1) / following * (new - weights), new, following
     return torch.where(weights.abs() > LEAST * weights.abs().amax(dim=1, keepdim=True), weights, 0)
