@@ -27,7 +27,7 @@ class Pinned:
             if known.any():
                 among = kernel[known][:, known] + 1e-9 * torch.eye(int(known.sum()), dtype=torch.float64, device=mask.device)
                 weights[column][:, known] = torch.linalg.solve(among, kernel[known]).T
-        self.weights = weights.float()
+        self.weights = weights.to(values.dtype)
 
     def __call__(self, clean: Tensor) -> Tensor:
         """Condition estimates ``(batch, horizon, state)``."""

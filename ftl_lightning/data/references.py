@@ -215,6 +215,6 @@ class _Header:
 def _drawn(paths: Tensor, count: int, draw: torch.Generator) -> Tensor:
     """Samples ``(count, horizon, state)`` of a Gaussian with the mean and covariance of paths ``(demo, horizon, state)``."""
     demos = len(paths)
-    weights = torch.randn(count, demos, generator=draw) / max(demos - 1, 1) ** 0.5
+    weights = torch.randn(count, demos, generator=draw).to(paths) / max(demos - 1, 1) ** 0.5
     mean = paths.mean(dim=0)
     return mean + torch.einsum("sd,dhc->shc", weights, paths - mean)

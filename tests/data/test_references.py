@@ -93,3 +93,16 @@ def test_a_reference_comes_back_from_its_file_and_what_does_not_fit_is_refused(t
         Reference.from_file(reference.tensors(), {**reference.header, "places": {"thing": (0, 9)}})
     with pytest.raises(UserError, match="form: expected one of"):
         Reference.from_file(reference.tensors(), {**reference.header, "name": "a program"})
+
+
+def test_large_offsets_are_kept(training: Demonstrations) -> None:
+    few = reaches("middle", 5, 3)
+    far = replace(few, states=few.states.double() + torch.tensor([5e6, 4e5, 0.0], dtype=torch.float64), observed={}, per_step=())
+    whole = replace(training, states=training.states.double() + 5e6, observed={}, per_step=())
+    for name in NAMES:
+        samples = Reference.of(name, far, Setting.of(whole, TIME), TIME).sample({}, 10, torch.Generator().manual_seed(0))
+        assert samples.dtype == torch.float64
+        moved = samples[:, -1] - samples[:, 0]
+        steps = (samples[:, 1:, :2] - samples[:, :-1, :2]).norm(dim=2)
+        assert float(moved.norm(dim=1).min()) > 0.1
+        assert float(steps[steps > 0].min()) < 0.1  # float32 has steps of half a metre there
