@@ -23,7 +23,7 @@ from ftl_lightning.igm.forms.choice import _by_skill
 from ftl_lightning.igm.forms.combination import Combination
 from ftl_lightning.igm.forms.skill import LeftOut
 from ftl_lightning.igm.samplers import SAMPLERS, Sampling
-from ftl_lightning.igm.settings import ADAPTED, COMBINED, MODES, NOT_LEARNED, ONE, InversionSettings
+from ftl_lightning.igm.settings import ADAPTED, COMBINED, MIXED, MODES, NOT_LEARNED, ONE, InversionSettings
 from ftl_lightning.methods.ftl_igm.model import DiffusionConfig, GenerativeModel
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.training.model_config import Prepared
@@ -153,7 +153,7 @@ def test_forms_that_learn_no_embedding_are_kept_sampled_and_composed(model: FewS
 def test_the_form_of_ones_own_data_is_chosen_by_skill_beside_references(model: FewShot) -> None:
     learned = model.learn(walks("between", 4), name="between")
     choice = learned.concept.choice
-    assert set(choice.skills) == {COMBINED, ONE, ADAPTED, MODES, KNOWN, *NAMES}
+    assert set(choice.skills) == {COMBINED, ONE, ADAPTED, MIXED, MODES, KNOWN, *NAMES}
     assert choice.form in (SHIFTED, WARPED)  # an untrained model is no rival
     assert "no learned form is as good on left-out demonstrations" in choice.because
     assert all(0 < skill < 2 for skill in choice.skills.values())

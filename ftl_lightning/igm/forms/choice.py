@@ -26,7 +26,7 @@ RANK, RATE, ADAPTER_STEPS = 1, 3e-3, 120
 SKILLED: Mapping[str, Any] = {"adapter": 8, "adapter_learning_rate": 6e-3, "components": 1, "omega": 1.0, "samples": 16}
 SKILLED_STEPS = 200
 """Settings of the adapter that :func:`by_skill` learns, and steps of the adapter and of modes."""
-SIMPLEST = (COMBINED, ONE, ADAPTED, MODES)
+SIMPLEST = (COMBINED, ONE, ADAPTED, MIXED, MODES)
 """Learned forms of :func:`by_skill`, the simplest first."""
 MODE_SAMPLES, MODE_STEPS = 16, 400
 """Noised demonstrations a step, and maximum number of steps, of modes without an adapter."""
@@ -192,7 +192,10 @@ def by_skill(
         assert modes is not None
         rest = [[row for row in range(len(demonstrations)) if row != out] for out in left.rows]
         kept = [replace(modes, embeddings=modes.embeddings[rows], weights=modes.weights[rows]) for rows in rest]
-        scores[MODES] = left.score([replace(first, modes=each).composition for each in kept], seed)
+        for kind, mixed in ((MODES, False), (MIXED, True)):
+            whole[kind] = replace(whole[MODES], modes=replace(modes, mixed=mixed, stretch=even_stretch(len(modes))))
+            part = [replace(each, mixed=mixed, stretch=even_stretch(len(each))) for each in kept]
+            scores[kind] = left.score([replace(first, modes=each).composition for each in part], seed)
     references = left.references(first.composition.uncomposed, seed)
     every = scores | references
     form, because = _by_skill({name: scores[name] for name in SIMPLEST if name in whole}, references, left)
