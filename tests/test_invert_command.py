@@ -50,7 +50,9 @@ def test_it_writes_and_prints_what_the_trainer_does(model: Path, file: Path, cap
     assert "learning 2 concepts: 5 steps" in without.err
 
 
-@pytest.mark.parametrize(("options", "form"), [([], "form chosen"), (["--model.form=paper"], "")])
+@pytest.mark.parametrize(
+    ("options", "form"), [pytest.param([], "form chosen", marks=pytest.mark.slow), (["--model.form=paper"], "")]
+)
 def test_rows_name_the_form_that_was_learned(model: Path, file: Path, options: list[str], form: str) -> None:
     quick = ["--data.steps=2", "--evaluation.samples=1", "--evaluation.steps=2", "--evaluation.figures=0"]
     quick += ["--evaluation.diversity=false", "--evaluation.results=rows.csv", *QUIET, *options]

@@ -307,7 +307,7 @@ WRONG: list[tuple[Callable[[Things], Any], str]] = [
     ),
     (
         lambda of: of.scenes.sample(of.scenes[SCENE], num_inference_steps=3),
-        "sample: expected sampler, steps, temperature (or count, observed, seed, batch_size, progress), "
+        "sample: expected sampler, steps, temperature (or count, observed, seed, pin, batch_size, progress), "
         "found 'num_inference_steps'; model.tuned shows all settings; did you mean steps?",
     ),
     *((lambda of, n=n: of.scenes.sample(of.scenes[SCENE], steps=n), f"steps: expected 1 or more, found {n}") for n in (0, -1)),
