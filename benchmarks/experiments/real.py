@@ -21,6 +21,7 @@ from real_data import FEW, FEW_SEED, FRESH_SEED, NAMES, REAL, RULE, RealSet, set
 
 from ftl_lightning.data.references import WARPED
 from ftl_lightning.few_shot.learner import FewShot
+from ftl_lightning.igm.forms.choice import SIMPLEST
 
 SHOWN = 100
 """Samples that a rule judges."""
@@ -71,11 +72,10 @@ def table(rows: list[dict[str, object]]) -> str:
     for name in dict.fromkeys(str(row["set"]) for row in rows):
         some = [row for row in rows if row["set"] == name]
         truths, skills = [row["truth"] for row in some], [row["skill"] for row in some]
-        learned = ("combination", "one set", "adapter", "modes")
         numbers = [
             mean(truth["chosen"] for truth in truths),  # type: ignore[index]
             mean(truth[WARPED] for truth in truths),  # type: ignore[index]
-            mean(max(skill[form] for form in learned if form in skill) for skill in skills),  # type: ignore[index, operator]
+            mean(max(skill[form] for form in SIMPLEST if form in skill) for skill in skills),  # type: ignore[index, operator]
             mean(skill[WARPED] for skill in skills),  # type: ignore[index]
         ]
         forms = ", ".join(sorted({str(row["form"]) for row in some}))

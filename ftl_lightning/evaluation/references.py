@@ -26,12 +26,12 @@ from torch import Tensor
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.distances import scaled_distance
 from ftl_lightning.data.features import InitialStates, check_starts
+from ftl_lightning.data.places import first_windows
 from ftl_lightning.domains.domain import COVERAGE, NOVELTY, Domain
 from ftl_lightning.domains.execution import ClosedLoop, Rollout
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.evaluation.closed_loop import PlanFollower, fixed_plans, roll_out
 from ftl_lightning.evaluation.generation import TaskResult
-from ftl_lightning.igm.forms.quality import first_windows
 from ftl_lightning.services.errors import require
 from ftl_lightning.services.progress import bar
 from ftl_lightning.services.randomness import FRESH_SEED
@@ -169,11 +169,11 @@ class Real:
         horizon, domain = self.domain.plans.horizon, self.domain
         if behaviour is None or plans.shape[1] != horizon:
             return measured
-        distance = domain.comparison.distance or scaled_distance(first_windows(behaviour, horizon)[0], domain.plans.resolution)
+        distance = domain.comparison.distance or scaled_distance(first_windows(behaviour, horizon), domain.plans.resolution)
         if self.demonstrations is not None:
-            measured[NOVELTY] = novelty(domain.distances(plans, first_windows(self.demonstrations, horizon)[0], distance))
+            measured[NOVELTY] = novelty(domain.distances(plans, first_windows(self.demonstrations, horizon), distance))
         if self.fresh:
-            measured[COVERAGE] = coverage(domain.distances(plans, first_windows(self.fresh[0], horizon)[0], distance))
+            measured[COVERAGE] = coverage(domain.distances(plans, first_windows(self.fresh[0], horizon), distance))
         return measured
 
     def added(self, judged: TaskResult) -> TaskResult:
@@ -201,7 +201,7 @@ class Real:
 
     def _judged(self, behaviour: Demonstrations) -> TaskResult:
         starts = behaviour.initial_states if self.domain.observed else None
-        plans, _ = first_windows(behaviour, self.domain.plans.horizon)
+        plans = first_windows(behaviour, self.domain.plans.horizon)
         return self.added(TaskResult.of(self.task, plans, starts, self.domain))
 
 

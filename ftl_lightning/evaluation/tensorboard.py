@@ -18,6 +18,7 @@ from tensorboard.compat.proto.summary_pb2 import Summary
 from torch.utils.tensorboard.summary import hparams, scalar
 from torch.utils.tensorboard.writer import FileWriter
 
+from ftl_lightning.data.places import first_windows
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.pictures import Drawn, beside
 from ftl_lightning.evaluation.generation import LOST, WON, TaskResult, share
@@ -25,7 +26,6 @@ from ftl_lightning.evaluation.pictures import captioned, gif, outcome_text
 from ftl_lightning.evaluation.results import METHOD, Row
 from ftl_lightning.evaluation.summary import plain, summary_table
 from ftl_lightning.igm.concept import Part, Point
-from ftl_lightning.igm.forms.quality import first_windows
 from ftl_lightning.services.text import line
 from ftl_lightning.training.board import FILMS, PICTURES, RESULTS, ROLLOUTS
 
@@ -68,7 +68,7 @@ def picture(behaviour: TaskResult, domain: Domain, figures: int) -> "Figure":
     states, demonstrations = behaviour.states[shown], behaviour.demonstrations
     if demonstrations is None:
         return domain.show.picture(states, right, title(behaviour), starts)
-    windows, first = first_windows(demonstrations, states.shape[1])
+    windows, first = first_windows(demonstrations, states.shape[1]), demonstrations.initial_states
     above = f"demonstrations: {', '.join(behaviour.task.learned)}"
     below = "samples" if right is None else f"samples: {sum(right)} right (green), {right.count(False)} wrong (red)"
     return beside(

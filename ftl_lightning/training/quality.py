@@ -9,11 +9,12 @@ from torch import Tensor
 
 from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.data.features import InitialStates
+from ftl_lightning.data.places import first_windows
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.from_file import own_domain
 from ftl_lightning.domains.pictures import Drawn, beside
 from ftl_lightning.igm.concept import Concept, QualityRecord
-from ftl_lightning.igm.forms.quality import Quality, encoded, first_windows, generated, observed_from
+from ftl_lightning.igm.forms.quality import Quality, encoded, generated, observed_from
 from ftl_lightning.services.errors import require
 from ftl_lightning.training.concept_model import ConceptModel
 
@@ -122,7 +123,7 @@ def inspected(model: ConceptModel, domain: Domain, demonstrations: Demonstration
         return None
     name = concept.origin.name
     samples, starts = generated(model, demonstrations, {name: concept}, seed=0)
-    plans, (known, first) = samples[name], first_windows(demonstrations, model.config.horizon)
+    plans, known, first = samples[name], first_windows(demonstrations, model.config.horizon), demonstrations.initial_states
     right = None
     if domain.concepts.reads(name):
         right = right_plans(domain.measure(name, plans, starts if domain.observed else None))

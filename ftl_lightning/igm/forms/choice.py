@@ -1,6 +1,6 @@
 """Forms of learned concepts, and selection of a form by leave-one-out error."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -179,7 +179,7 @@ def by_skill(
         alone[combination.best] = 1
         scores[KNOWN] = left.score([combined(model, alone)] * len(left.rows), seed)
     parts = left.parts()
-    sets = learned_from(model, demonstrations, _rows_of(len(demonstrations), left.rows), quickly(settings), steps, tell)
+    sets = learned_from(model, demonstrations, left.others, quickly(settings), steps, tell)
     scores[ONE] = left.score([sets.row(fold) for fold in range(len(parts))], seed)
     labelled = concatenate([replace(part, concepts=(f"{fold}",) * len(part)) for fold, part in enumerate([demonstrations, *parts])])
     adapted, *without = _adapted(model, labelled, settings.changed(**SKILLED), steps, False, tell, by_sample=True).values()
@@ -190,8 +190,7 @@ def by_skill(
         whole[MODES] = _with_modes(model, demonstrations, settings, few, {name: first}, tell)[name]
         modes = whole[MODES].modes
         assert modes is not None
-        rest = [[row for row in range(len(demonstrations)) if row != out] for out in left.rows]
-        kept = [replace(modes, embeddings=modes.embeddings[rows], weights=modes.weights[rows]) for rows in rest]
+        kept = [replace(modes, embeddings=modes.embeddings[rows], weights=modes.weights[rows]) for rows in left.others]
         for kind, mixed in ((MODES, False), (MIXED, True)):
             whole[kind] = replace(whole[MODES], modes=replace(modes, mixed=mixed, stretch=even_stretch(len(modes))))
             part = [replace(each, mixed=mixed, stretch=even_stretch(len(each))) for each in kept]
@@ -204,10 +203,6 @@ def by_skill(
     composing = None if COMBINED not in whole or form == COMBINED else (whole[COMBINED].embeddings, whole[COMBINED].weights)
     keep = composing is not None and float(scores[COMBINED].mean()) <= float(scores[ONE].mean())
     return replace(chosen, choice=Choice(form, because, numbers), composing=composing if keep else None)
-
-
-def _rows_of(count: int, left: Sequence[int]) -> list[list[int]]:
-    return [[row for row in range(count) if row != out] for out in left]
 
 
 def _by_skill(learned: Mapping[str, Tensor], references: Mapping[str, Tensor], left: LeftOut) -> tuple[str, str]:

@@ -10,6 +10,7 @@ from torch import Tensor
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.distances import path_distance
 from ftl_lightning.data.features import InitialStates, moved
+from ftl_lightning.data.places import first_windows
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.igm.model import Invertible
 from ftl_lightning.igm.samplers import Sampling
@@ -116,7 +117,7 @@ def measured(model: Invertible, demonstrations: Demonstrations, concepts: Mappin
     Args:
         demonstrations: two or more, which also provide the initial states.
     """
-    known = encoded(model, *first_windows(demonstrations, model.horizon))
+    known = encoded(model, first_windows(demonstrations, model.horizon), demonstrations.initial_states)
     plans, starts = generated(model, demonstrations, concepts, seed)
     return {
         name: Quality.of(encoded(model, samples, starts), known, observed_from(demonstrations)) for name, samples in plans.items()
@@ -145,12 +146,6 @@ def _turns(demonstrations: Demonstrations) -> Tensor:
 def observed_from(demonstrations: Demonstrations) -> Tensor | None:
     """The same; ``None`` without observations."""
     return _turns(demonstrations) if demonstrations.observed else None
-
-
-def first_windows(demonstrations: Demonstrations, horizon: int) -> tuple[Tensor, InitialStates]:
-    """First windows of demonstrations ``(demo, horizon, state)``, and their initial states."""
-    rows = torch.arange(len(demonstrations))
-    return demonstrations.windows(rows, torch.zeros_like(rows), horizon)[0], demonstrations.initial_states
 
 
 def encoded(model: Invertible, plans: Tensor, starts: InitialStates) -> Tensor:

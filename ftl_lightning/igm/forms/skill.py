@@ -8,10 +8,11 @@ from torch import Tensor
 
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.energy import PathFeatures, ceiling
-from ftl_lightning.data.features import InitialStates, moved
+from ftl_lightning.data.features import moved
 from ftl_lightning.data.places import first_windows
 from ftl_lightning.data.references import NAMES, SHIFTED, Reference, Setting
 from ftl_lightning.igm.composition import Composition
+from ftl_lightning.igm.forms.quality import encoded
 from ftl_lightning.igm.model import Invertible
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.services.randomness import generator
@@ -38,6 +39,7 @@ class LeftOut:
 
     Attributes:
         rows: left-out demonstrations ``(fold,)``.
+        others: rows of the other demonstrations, for each left-out one.
         fresh: score of fresh demonstrations, from the distances among the demonstrations; where places are observed, from those
             among the demonstrations moved to the places of each.
         setting: what the training concepts say about behaviour, for references.
@@ -46,10 +48,11 @@ class LeftOut:
     def __init__(self, model: Invertible, demonstrations: Demonstrations, training: Demonstrations) -> None:
         self.model, self.demonstrations = model, demonstrations
         self.rows = list(range(0, len(demonstrations), -(-len(demonstrations) // FOLDS)))
+        self.others = [[row for row in range(len(demonstrations)) if row != out] for out in self.rows]
         self.setting = Setting.of(training, model.horizon)
-        real = self._encoded(first_windows(training, model.horizon), training.initial_states)
+        real = encoded(self.model, first_windows(training, model.horizon), training.initial_states)
         self.features = PathFeatures(real)
-        known = self._encoded(first_windows(demonstrations, model.horizon), demonstrations.initial_states)
+        known = encoded(self.model, first_windows(demonstrations, model.horizon), demonstrations.initial_states)
         self.truth = known[self.rows]
         some = torch.randperm(len(real), generator=generator("cpu", 0, 8))[: 4 * SAMPLES]
         self.unit = self.features.scores(real[some].expand(len(self.rows), -1, -1, -1), self.truth).mean(dim=0).clamp(min=1e-9)
@@ -63,7 +66,7 @@ class LeftOut:
         every = []
         for row in range(whole):
             starts = self.demonstrations.initial_states.take(torch.full((whole,), row))
-            every.append(ceiling(self.features, self._encoded(moved.each(starts.observed), starts)))
+            every.append(ceiling(self.features, encoded(self.model, moved.each(starts.observed), starts)))
         return torch.stack(every).mean(dim=0)
 
     def skill(self, score: Tensor | float) -> float:
@@ -72,8 +75,7 @@ class LeftOut:
 
     def parts(self) -> list[Demonstrations]:
         """The demonstrations without each left-out one, ``(fold,)``."""
-        every = range(len(self.demonstrations))
-        return [self.demonstrations.rows([row for row in every if row != out]) for out in self.rows]
+        return [self.demonstrations.rows(rows) for rows in self.others]
 
     def score(self, compositions: Sequence[Composition], seed: int) -> Tensor:
         """Scores ``(fold,)`` of samples of the compositions that were learned without each left-out demonstration."""
@@ -82,7 +84,7 @@ class LeftOut:
         sampling = replace(SAMPLING, steps=min(SAMPLING.steps, self.model.max_steps or SAMPLING.steps))
         together = [composition.to(self.model.device) for composition in compositions]
         plans = self.model.sample(together, SAMPLES, sampling, draws, moved(starts.observed, self.model.device)).cpu()
-        scores = self.features.scores(self._encoded(plans.flatten(0, 1), starts).unflatten(0, plans.shape[:2]), self.truth)
+        scores = self.features.scores(encoded(self.model, plans.flatten(0, 1), starts).unflatten(0, plans.shape[:2]), self.truth)
         return (scores / self.unit).mean(dim=1)
 
     def references(self, like: Composition, seed: int) -> dict[str, Tensor]:
@@ -92,6 +94,3 @@ class LeftOut:
             name: self.score([replace(like, made=Reference.of(name, part, self.setting, horizon)) for part in parts], seed)
             for name in NAMES
         }
-
-    def _encoded(self, paths: Tensor, starts: InitialStates) -> Tensor:
-        return self.model.encode(paths.to(self.model.device), moved(starts.observed, self.model.device)).cpu()
