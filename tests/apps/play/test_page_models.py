@@ -55,6 +55,13 @@ def choose(page: Browser, model: str, wait: bool = True) -> None:
         page.until(lambda: page.js("state.model.name") == model and int(page.data("samples")) > before)
 
 
+def front(page: Browser, tab: str) -> None:
+    """Go to a tab. The driver alone leaves the tab in the background, where a click can be lost."""
+    page.driver.switch_to.window(tab)
+    page.driver.execute_cdp_cmd("Page.bringToFront", {})
+    page.until(lambda: page.js("document.visibilityState") == "visible")
+
+
 def put(page: Browser, name: str, value: Any, event: str = "input") -> None:
     """A value into an element by its id."""
     script = "((one, value, event) => { one.value = value; one.dispatchEvent(new Event(event, { bubbles: true })); })"
@@ -147,13 +154,13 @@ def test_two_tabs_show_two_models(page: Browser, several: Served) -> None:
         opened(page, several)
         choose(page, "agent")
         second = page.driver.current_window_handle
-        windows.window(first)
+        front(page, first)
         page.window()
         take(page)
         page.until(lambda: page.count("#learned") == 1)
         assert "from_pretrained('strokes')" in page.js("find('python').textContent")
         assert page.text("error-text") == ""
-        windows.window(second)
+        front(page, second)
         assert page.js("state.model.name") == "agent"
         before = int(page.data("samples"))
         page.click("noise")
