@@ -121,7 +121,7 @@ def explain(concept: str, pretrained: str = "", nearest: int = 3) -> None:
     if learned.composing is not None or combination:
         say(f"combination of training concepts: {combination or formula(*(learned.composing or alone), names, training)}")
     if learned.reference is not None:
-        say(f"alone its samples are made without the model ({learned.reference.name}); composed, they are from the components")
+        say(f"alone, {learned.share:.0%} of its samples are made without the model ({learned.reference.name}); composed, none are")
     if learned.modes is not None:
         how = "a random mixture of them" if learned.modes.mixed else "one of them"
         composed = "composed too" if learned.knots > 1 else "composed, from the components that have no mode"

@@ -78,12 +78,20 @@ class PathFeatures:
         return torch.stack([_energy(values.unflatten(0, (demos, count)), real) / unit for values, real, unit in features], dim=1)
 
 
+def apart(samples: Tensor, truth: Tensor) -> Tensor:
+    """Mean distances ``(demo,)`` of samples ``(demo, sample, n)`` from ``(demo, n)``."""
+    return (samples - truth[:, None]).norm(dim=2).mean(dim=1)
+
+
+def among(samples: Tensor) -> Tensor:
+    """Mean distances ``(demo,)`` between different samples ``(demo, sample, n)``; 0 for a single one."""
+    count = samples.shape[1]
+    return torch.cdist(samples, samples).sum(dim=(1, 2)) / max(count * (count - 1), 1)
+
+
 def _energy(samples: Tensor, truth: Tensor) -> Tensor:
     """Energy scores ``(demo,)`` of samples ``(demo, sample, n)`` for ``(demo, n)``."""
-    apart = (samples - truth[:, None]).norm(dim=2).mean(dim=1)
-    count = samples.shape[1]
-    among = torch.cdist(samples, samples).sum(dim=(1, 2)) / max(count * (count - 1), 1)
-    return apart - among / 2
+    return apart(samples, truth) - among(samples) / 2
 
 
 def _mean_distance(values: Tensor) -> Tensor:

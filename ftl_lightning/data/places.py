@@ -21,6 +21,8 @@ RIDGE, WINDOW = 0.01, 0.05
 """Ridge penalty of the shares with which paths follow places, relative to the places' mean square; half width of the window of
 times that share an estimate, as a share of the horizon.
 """
+PRIOR = 0.01
+"""Ridge penalty of the weights of known frames, relative to the mean square of what they explain."""
 
 
 def first_windows(demonstrations: Demonstrations, horizon: int) -> Tensor:
@@ -97,10 +99,16 @@ class Frames:
     shares: Tensor
 
     @classmethod
-    def fit(cls, paths: Tensor, observed: Observed, known: Places) -> Self:
-        """Fit to a few paths ``(demo, horizon, state)`` of one concept and their observed features ``(demo, ...)``."""
+    def fit(cls, paths: Tensor, observed: Observed, known: Places, prior: Tensor | None = None) -> Self:
+        """Fit to a few paths ``(demo, horizon, state)`` of one concept and their observed features ``(demo, ...)``.
+
+        With a ``prior``, shares ``(frame, place, time)`` of several concepts, the ridge regression starts at the weighted sum of
+        the prior's shares that explains the paths best, and not at 0. A single path has their mean.
+        """
         named = {name: columns for name, columns in known.items() if name in observed}
         count, horizon, width = paths.shape
+        if prior is not None and count < 2:
+            return cls(named, prior.mean(dim=0))
         if not named or count < 2:
             return cls({}, paths.new_zeros(0, horizon))
         spread = (paths - paths.mean(dim=0)).square().mean(dim=(0, 1)).sqrt()
@@ -115,15 +123,37 @@ class Frames:
         near = ((time[:, None] - time).abs() <= WINDOW * horizon).to(paths)
         targets = near @ targets / near.sum(dim=1, keepdim=True)
         gram = regressors @ regressors.T
+        start = paths.new_zeros(len(named), horizon)
+        if prior is not None:
+            explained = torch.einsum("fpt,pn->ftn", prior.to(paths), regressors).flatten(1)
+            products = explained @ explained.T
+            even = torch.full((len(prior),), 1 / len(prior), dtype=paths.dtype)
+            ridge = PRIOR * products.diagonal().mean() * torch.eye(len(prior), dtype=paths.dtype)
+            weights = even + torch.linalg.solve(products + ridge, explained @ (targets.flatten() - even @ explained))
+            start = torch.einsum("f,fpt->pt", weights, prior.to(paths))
         penalty = RIDGE * gram.diagonal().mean() * torch.eye(len(gram))
-        return cls(named, torch.linalg.solve(gram + penalty, regressors @ targets.T))
+        missing = regressors @ (targets - start.T @ regressors).T
+        return cls(named, start + torch.linalg.solve(gram + penalty, missing))
 
     def shift(self, observed: Observed, width: int) -> Tensor:
         """What the places add to paths ``(sample, horizon, state)``; ``(1, horizon, state)`` of zeros without places."""
-        total = self.shares.new_zeros(1, self.shares.shape[1], width)
-        for share, (name, columns) in zip(self.shares, self.places.items(), strict=True):
-            values = observed[name].flatten(1).to(self.shares)
-            added = self.shares.new_zeros(len(values), self.shares.shape[1], width)
-            added[..., list(columns)] = share[:, None] * values[:, None]
-            total = total + added
-        return total
+        return shift(self.shares[None], self.places, observed, width)
+
+
+def shift(shares: Tensor, places: Places, observed: Observed, width: int) -> Tensor:
+    """What places add to paths ``(sample, time, width)``, by shares ``(sample, place, time)`` or ``(1, place, time)``."""
+    total = shares.new_zeros(1, shares.shape[2], width)
+    for number, (name, columns) in enumerate(places.items()):
+        values = observed[name].flatten(1).to(shares)
+        added = shares.new_zeros(len(values), shares.shape[2], width)
+        added[..., list(columns)] = shares[:, number, :, None] * values[:, None]
+        total = total + added
+    return total
+
+
+def frames_of(demonstrations: Demonstrations, horizon: int, known: Places, prior: Tensor | None = None) -> Tensor:
+    """Shares ``(concept, place, horizon)`` of :class:`Frames`, of each concept of the demonstrations, in their order."""
+    paths, observed, texts = first_windows(demonstrations, horizon), vectors_of(demonstrations), demonstrations.concepts
+    rows = [[row for row, text in enumerate(texts) if text == name] for name in dict.fromkeys(texts)]
+    fits = [Frames.fit(paths[some], {key: values[some] for key, values in observed.items()}, known, prior) for some in rows]
+    return torch.stack([fit.shares for fit in fits]).float()

@@ -163,7 +163,7 @@ class FewShot(Shown):
         Raises:
             UserError: for an unknown text.
         """
-        return Composition(self.model.concept(text)[None, None], torch.ones(1, device=self.device), space=self._space)
+        return replace(self.model[text], space=self._space)
 
     def library(self, *folders: str | Path) -> Library:
         """Library of the model's concepts: training concepts, learned concepts in its folder, and saved concepts.

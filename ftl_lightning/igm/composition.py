@@ -54,11 +54,14 @@ class Composition(Shown):
             plan: the mean of behaviour at different times is no behaviour. The modes of two such concepts are combined pairwise.
         columns: share of each concept's weight on each column of a state ``(..., K, state)``, usually 0 or 1; ``None`` for the full
             weight on every column.
+        frames: shares of observed places in each concept's plans ``(..., K, place, time)``, see
+            :class:`~ftl_lightning.data.places.Frames`; ``None`` for a model without places.
         adapters: modifications of the denoiser, assigned to concepts by ``adapter``.
         adapter: ``(..., K)`` int64, number of each concept's adapter, from 1; 0 for the unmodified denoiser; ``None`` for zeros.
         alone: composition for sampling the concept alone; ``None`` for this composition.
         made: maker of samples without the model; ``None`` for samples of the composed denoiser. Compositions of several concepts
             ignore it.
+        share: share of the samples that are made by ``made``, 0 to 1.
         space: concept space, see :func:`space_of`; empty if unknown.
 
     Raises:
@@ -69,10 +72,12 @@ class Composition(Shown):
     weights: Tensor
     modes: Modes | None = field(default=None, kw_only=True)
     columns: Tensor | None = field(default=None, kw_only=True)
+    frames: Tensor | None = field(default=None, kw_only=True)
     adapters: tuple[Adapter, ...] = field(default=(), kw_only=True)
     adapter: Tensor | None = field(default=None, kw_only=True)
     alone: "Composition | None" = field(default=None, kw_only=True)
     made: Maker | None = field(default=None, kw_only=True)
+    share: float = field(default=1.0, kw_only=True)
     space: str = field(default="", kw_only=True)
 
     def __post_init__(self) -> None:
@@ -101,7 +106,7 @@ class Composition(Shown):
         if self.adapters:
             yield counted(len(self.adapters), "adapter")
         if self.made is not None:
-            yield self.made.name
+            yield f"{self.share:.0%} {self.made.name}"
         if self.alone is not None:
             yield "another form where it stands alone"
         yield f"of {self.space or 'any model'}"
@@ -131,6 +136,7 @@ class Composition(Shown):
             torch.cat([part.weights for part in parts], dim=-1),
             modes=_summed_modes(self, other),
             columns=None if state is None else torch.cat([part.shares(state) for part in parts], dim=-2),
+            frames=None if self.frames is None or other.frames is None else torch.cat((self.frames, other.frames), dim=-3),
             adapters=adapters,
             adapter=torch.cat((self.adapter_number, after), dim=-1) if adapters else None,
             space=self.space or other.space,
@@ -163,6 +169,15 @@ class Composition(Shown):
         return self.weights.new_ones((*self.weights.shape, state)) if self.columns is None else self.columns
 
     @property
+    def frame(self) -> Tensor | None:
+        """Shares of observed places in composed plans ``(..., place, time)``: the concepts' mean, by their positive weights."""
+        if self.frames is None:
+            return None
+        weights = self.weights.detach().clamp(min=0)
+        weights = torch.where(weights.sum(dim=-1, keepdim=True) > 0, weights, 1.0)
+        return torch.einsum("...k,...kpt->...pt", weights / weights.sum(dim=-1, keepdim=True), self.frames)
+
+    @property
     def adapter_number(self) -> Tensor:
         """Number of each concept's adapter ``(..., K)`` int64, from 1; 0 for none."""
         return self.weights.new_zeros(self.weights.shape, dtype=torch.int64) if self.adapter is None else self.adapter
@@ -182,6 +197,7 @@ class Composition(Shown):
             weights=self.weights.to(device),
             modes=self.modes and self.modes.to(device),
             columns=None if self.columns is None else self.columns.to(device),
+            frames=None if self.frames is None else self.frames.to(device),
             adapter=None if self.adapter is None else self.adapter.to(device),
             alone=self.alone and self.alone.to(device),
         )
@@ -203,14 +219,16 @@ class Composition(Shown):
             embeddings, weights, row = self.modes.draw(count, generator)
         columns = None if self.columns is None else self.columns.expand(len(weights), *self.columns.shape)
         adapter = None if self.adapter is None else self.adapter.expand(len(weights), *self.adapter.shape)
-        return self._with(embeddings=embeddings, weights=weights, modes=None, columns=columns, adapter=adapter), row
+        frames = None if self.frames is None else self.frames.expand(len(weights), *self.frames.shape)
+        return self._with(embeddings=embeddings, weights=weights, modes=None, columns=columns, adapter=adapter, frames=frames), row
 
-    def row(self, number: int) -> "Composition":
-        """Row ``(K, ...)`` of compositions ``(row, K, ...)`` without modes; ``number`` counts from 0."""
+    def row(self, number: int | slice) -> "Composition":
+        """Row ``(K, ...)``, or rows, of compositions ``(row, K, ...)`` without modes; ``number`` counts from 0."""
         return self._with(
             embeddings=self.embeddings[number],
             weights=self.weights[number],
             columns=None if self.columns is None else self.columns[number],
+            frames=None if self.frames is None else self.frames[number],
             adapter=None if self.adapter is None else self.adapter[number],
         )
 

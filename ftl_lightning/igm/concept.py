@@ -28,6 +28,8 @@ MODES = ("mode_embeddings", "mode_weights")
 """Tensors of the modes, with the header's key ``mixed``; only in files of concepts with modes."""
 COMPOSING = ("composing_embeddings", "composing_weights")
 """Tensors that replace all others when composing; only in files of concepts with such a set."""
+FRAMES = "frames"
+"""Tensor of the shares of observed places; only in files of models with places."""
 ADAPTER = "adapter/"
 """Prefix of the tensors of an adapter."""
 REFERENCE = "reference/"
@@ -179,7 +181,10 @@ class Concept(Shown):
             ``None`` to compose the concept as it is alone.
         reference: maker of the concept's samples without the model, such as a shifted demonstration; ``None`` for samples of the
             model. Composing uses the embeddings.
+        share: share of the samples alone that the reference makes, above 0 to 1.
         quality: quality of the samples; ``None`` if not measured. Optional key of the file's header.
+        frames: shares of observed places in plans ``(place, horizon)``, see :class:`~ftl_lightning.data.places.Frames`; ``None``
+            for a model without places.
 
     Raises:
         UserError: at construction, for wrong shapes or dtypes.
@@ -194,9 +199,12 @@ class Concept(Shown):
     composing: tuple[Tensor, Tensor] | None = None
     quality: QualityRecord | None = None
     reference: Reference | None = None
+    frames: Tensor | None = None
+    share: float = 1.0
 
     def __post_init__(self) -> None:
         _expect_shapes(self._sets)
+        check_range("key 'share'", self.share, 0, 1)
 
     @property
     def _sets(self) -> dict[str, Tensor]:
@@ -206,7 +214,7 @@ class Concept(Shown):
             sets |= dict(zip(MODES, (self.modes.embeddings, self.modes.weights), strict=True))
         if self.composing is not None:
             sets |= dict(zip(COMPOSING, self.composing, strict=True))
-        return sets
+        return sets if self.frames is None else sets | {FRAMES: self.frames}
 
     @property
     def knots(self) -> int:
@@ -223,7 +231,7 @@ class Concept(Shown):
         if self.adapter is not None:
             yield "an adapter"
         if self.reference is not None:
-            yield self.reference.name
+            yield f"{self.share:.0%} {self.reference.name}"
         yield f"loss {self.origin.loss:.3f}"
         yield f"weights {numbers(self.weights.tolist())}"
         yield f"from {counted(self.origin.count, 'demonstration')}"
@@ -233,15 +241,21 @@ class Concept(Shown):
     def composition(self) -> Composition:
         """The concept as a composition, to sample alone or to compose."""
         space = space_of(self.origin.domain, self.origin.pretrained)
-        plain = Composition(self.embeddings, self.weights, modes=self.modes, space=space)
+        plain = Composition(self.embeddings, self.weights, modes=self.modes, frames=self._frames(self.weights), space=space)
         if self.adapter is not None:
             plain = replace(plain, adapters=(self.adapter,), adapter=torch.ones(len(self.weights), dtype=torch.int64))
         if self.reference is not None:
-            plain = replace(plain, made=self.reference)
+            plain = replace(plain, made=self.reference, share=self.share)
         composing = self.composing
         if composing is None and self.reference is not None:
             composing = self.embeddings, self.weights
-        return plain if composing is None else Composition(*composing, alone=plain, space=space)
+        if composing is None:
+            return plain
+        return Composition(*composing, frames=self._frames(composing[1]), alone=plain, space=space)
+
+    def _frames(self, weights: Tensor) -> Tensor | None:
+        """Frames of each component ``(K, place, horizon)``."""
+        return None if self.frames is None else self.frames.expand(len(weights), *self.frames.shape)
 
     def component(self, number: int) -> Composition:
         """A single component; ``number`` counts from 1."""
@@ -313,7 +327,7 @@ class Concept(Shown):
         factors = {} if self.adapter is None else self.adapter.tensors()
         tensors = {**self._sets, **{f"{ADAPTER}{name}": factor for name, factor in factors.items()}}
         if self.reference is not None:
-            header |= {"reference": self.reference.header}
+            header |= {"reference": self.reference.header, "share": self.share}
             tensors |= {f"{REFERENCE}{name}": values for name, values in self.reference.tensors().items()}
         save_tensors(path, KIND, {name: values.contiguous() for name, values in tensors.items()}, header, VERSION)
 
@@ -330,6 +344,7 @@ class Concept(Shown):
         tensors, header = load_tensors(shipped(path), KIND, VERSION)
         several, composed = "mixed" in header, COMPOSING[0] in tensors
         names = ["embeddings", "weights", *(MODES if several else ()), *(COMPOSING if composed else ())]
+        names += [FRAMES] if FRAMES in tensors else []
         keys = [field.name for field in fields(Origin)]
         missing = [key for key in keys if key not in header] + [name for name in names if name not in tensors]
         with about(path):
@@ -352,7 +367,9 @@ class Concept(Shown):
             composing = (tensors[COMPOSING[0]], tensors[COMPOSING[1]]) if composed else None
             quality = from_mapping(QualityRecord, header["quality"], "quality") if header.get("quality") is not None else None
             reference = Reference.from_file(made, header.get("reference")) if made or "reference" in header else None
-            concept = cls(tensors["embeddings"], tensors["weights"], origin, modes, adapter, choice, composing, quality, reference)
+            share = check_type(header.get("share", 1.0), float, "share")
+            parts = (origin, modes, adapter, choice, composing, quality, reference, tensors.get(FRAMES), share)
+            concept = cls(tensors["embeddings"], tensors["weights"], *parts)
             if header.get("components", len(concept.weights)) != len(concept.weights):
                 raise UserError(f"key 'components': expected {len(concept.weights)}, found {shown(header['components'])}")
             concept.check_finite("content")
@@ -384,6 +401,8 @@ def _expect_shapes(tensors: Mapping[str, Tensor]) -> None:
     composing = (*tuple(tensors.get(COMPOSING[1], tensors["weights"]).shape)[:1], *shape[1:])
     expected = {"embeddings": shape, "weights": shape[:1], "mode_embeddings": (modes, *shape), "mode_weights": (modes, shape[0])}
     expected |= {COMPOSING[0]: composing, COMPOSING[1]: composing[:1]}
+    frames = tuple(tensors[FRAMES].shape) if FRAMES in tensors else ()
+    expected |= {FRAMES: frames if len(frames) == 2 and all(frames) else (0, 0)}
     for name, values in tensors.items():
         if values.shape != expected[name] or values.dtype != torch.float32:
             actual = f"{str(values.dtype).removeprefix('torch.')} of shape {tuple(values.shape)}"

@@ -112,6 +112,7 @@ class Inversion(nn.Module):
     Args:
         model, demonstrations, settings: see :func:`invert`.
         by_sample: see :func:`~ftl_lightning.igm.forms.adapter.adaptable`.
+        frames: frames of each concept ``(concept, place, horizon)``; ``None`` for those of its demonstrations.
 
     Attributes:
         embeddings: parameter ``(run, K, knots, n)``; a component has one embedding at each of ``knots`` times of the plan.
@@ -128,12 +129,18 @@ class Inversion(nn.Module):
 
     model: Invertible
     weights: Tensor
+    frames: Tensor | None
     basis: Tensor
     is_mode: Tensor
     kept: Tensor
 
     def __init__(
-        self, model: Invertible, demonstrations: Demonstrations, settings: InversionSettings, by_sample: bool = False
+        self,
+        model: Invertible,
+        demonstrations: Demonstrations,
+        settings: InversionSettings,
+        by_sample: bool = False,
+        frames: Tensor | None = None,
     ) -> None:
         super().__init__()
         model.check_settings(settings)
@@ -141,6 +148,8 @@ class Inversion(nn.Module):
         self.demonstrations, self.settings = demonstrations, settings
         self.concepts = tuple(dict.fromkeys(demonstrations.concepts))
         self.runs = self._runs()
+        frames = model.frames_of(demonstrations) if frames is None else frames
+        self.register_buffer("frames", None if frames is None else frames[[run.concept for run in self.runs]], persistent=False)
         # N training embeddings with mean 0 have rank N - 1 or less.
         training = model.training_embeddings
         basis = torch.linalg.svd(training, full_matrices=False).Vh[: max(len(training) - 1, 1)]
@@ -227,7 +236,8 @@ class Inversion(nn.Module):
 
     def _composition(self, embeddings: Tensor, weights: Tensor, runs: Sequence[int]) -> Composition:
         """Composition ``(run, K, ...)`` of some runs, with their adapters; detached adapters if all these runs are modes."""
-        composition = Composition(self.scale_off_span(embeddings), weights)
+        frames = None if self.frames is None else self.frames[list(runs), None].expand(-1, weights.shape[1], -1, -1)
+        composition = Composition(self.scale_off_span(embeddings), weights, frames=frames)
         if not self.factors:
             return composition
         indices = [self._adapter_index(run) for run in runs]
@@ -353,6 +363,7 @@ class Inversion(nn.Module):
                 self.model.origin(self.demonstrations, name, kind, losses[single].item(), pretrained),
                 Modes(embeddings[modes].cpu(), weights[modes].cpu(), mixed) if modes else None,
                 self._adapter(self._adapter_index(single)).copied() if self.factors else None,
+                frames=None if self.frames is None else self.frames[single].cpu(),
             )
             concepts[name].check_finite(f"inversion: concept {name!r}")
         return concepts

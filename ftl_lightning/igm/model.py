@@ -30,10 +30,12 @@ class Invertible(Protocol):
     Attributes:
         training_embeddings: embeddings of the training concepts ``(training concept, n)``, centred: their mean is 0.
         examples: demonstrations of training concepts, for a user's data; else ``None``.
+        frames: shares of observed places in plans ``(training concept, place, horizon)``; ``None`` for a model without places.
     """
 
     training_embeddings: Tensor
     examples: Demonstrations | None
+    frames: Tensor | None
 
     @property
     def device(self) -> torch.device:
@@ -59,6 +61,12 @@ class Invertible(Protocol):
     def text_space(self) -> bool:
         """Whether concepts are embeddings of a text encoder."""
 
+    def compositions(self, rows: slice | Tensor = slice(None)) -> Composition:
+        """Training concepts, each with weight 1: ``(row, 1, ...)``."""
+
+    def frames_of(self, demonstrations: Demonstrations) -> Tensor | None:
+        """Frames of each concept of the demonstrations ``(concept, place, horizon)``; ``None`` for a model without places."""
+
     def check_settings(self, settings: InversionSettings) -> None:
         """Raise ``UserError`` for settings that the model does not support."""
 
@@ -79,10 +87,11 @@ class Invertible(Protocol):
     def losses(self, states: Tensor, observed: Observed, composition: Composition, draws: Draws | None, loss: str) -> Tensor:
         """Loss of Eq. 2 ``(run, sample)`` of windows ``(run * sample, window, state)`` under compositions ``(run, K, ...)``."""
 
-    def products(self, states: Tensor, observed: Observed, draws: Draws | None, loss: str) -> Tensor | None:
+    def products(self, states: Tensor, observed: Observed, frames: Tensor | None, draws: Draws | None, loss: str) -> Tensor | None:
         """Inner products of the branches of all N training concepts, see :meth:`DiffusionModel.branch_products`.
 
-        ``(sample, 1 + N, 1 + N)`` for windows ``(sample, window, state)``; ``None`` for a model without a composed denoiser.
+        ``(sample, 1 + N, 1 + N)`` for windows ``(sample, window, state)`` and ``frames (1, place, window)``; ``None`` for a model
+        without a composed denoiser.
         """
 
     def sample(

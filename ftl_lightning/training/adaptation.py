@@ -184,8 +184,8 @@ class Adaptation(pl.LightningModule, ABC):
             concept = self._learned.get(task.learned[0])
             return None if concept is None else concept.composition.to(self.device)
         weights = [self.training_weight(task)] * len(task.texts) + [WITHOUT_WEIGHT] * len(task.without)
-        embeddings = [self.model.concept(text)[None, None] for text in (*task.texts, *task.without)]
-        parts = [Composition(text, text.new_tensor([weight])) for text, weight in zip(embeddings, weights, strict=True)]
+        texts = (*task.texts, *task.without)
+        parts = [weight * self.model[text] for text, weight in zip(texts, weights, strict=True)]
         names = [*task.texts, *task.without, *task.learned]
         for name in task.learned:
             concept = self._learned.get(name)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -11,7 +11,6 @@ from torch import Tensor
 from ftl_lightning.data.check import Finding, axes, check
 from ftl_lightning.data.demonstrations import Demonstrations, paths_of
 from ftl_lightning.data.features import moved
-from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.igm.explanation import formula
 from ftl_lightning.igm.forms.choice import combined
@@ -110,9 +109,7 @@ def known_as(
     model: ConceptModel, demonstrations: Demonstrations, settings: InversionSettings, tell: Callable[[int], None]
 ) -> Known:
     """The training concept with the lowest mean loss."""
-    embeddings = model.training_embeddings[:, None, None]
-    concepts = Composition(embeddings, torch.ones(embeddings.shape[:2], device=model.device))
-    losses = relative_losses(model, demonstrations, concepts, settings, tell)
+    losses = relative_losses(model, demonstrations, model.compositions(), settings, tell)
     best = int(losses.mean(dim=1).argmin())
     return Known(model.config.training_concepts[best], tuple(losses[best].tolist()))
 
@@ -230,7 +227,8 @@ def outside(model: ConceptModel, demonstrations: Demonstrations) -> Tensor:
         rows += [row] * len(begins)
         starts += begins
     states, observed = demonstrations.windows(torch.tensor(rows), torch.tensor(starts), model.window)
-    encoded: Tensor = model.encode(states.to(model.device), moved(observed, model.device))
+    frames = model.frames_of(replace(demonstrations, concepts=("",) * len(demonstrations)))
+    encoded: Tensor = model.encode(states.to(model.device), moved(observed, model.device), frames)
     return encoded.flatten(0, 1).T.cpu()
 
 

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import PINNED, READ, Feature, Observed, check_features, moved
-from ftl_lightning.data.places import Places, starts
+from ftl_lightning.data.places import Places, frames_of, shift, starts
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import EMPTY_CONCEPT, TRAINING_CONCEPT, Concept, Origin, Point
 from ftl_lightning.igm.forms.adapter import LowRank
@@ -49,6 +49,8 @@ class ConceptModel(Shown, nn.Module, ABC):
         empty: embedding ``(n,)`` of the empty concept (unconditional).
         training_embeddings: ``(training concept, n)`` in the model's concept space.
         examples: demonstrations of each training concept, saved with the weights, for a user's data.
+        frames: shares with which plans follow observed places ``(training concept, place, horizon)``: the network's plans are what
+            the places do not explain, see :class:`~ftl_lightning.data.places.Frames`; ``None`` without places.
     """
 
     method: ClassVar[Method]
@@ -59,6 +61,7 @@ class ConceptModel(Shown, nn.Module, ABC):
     """Whether concepts are learned by gradient descent on :meth:`losses`."""
     empty: Tensor
     training_embeddings: Tensor
+    frames: Tensor | None
 
     def __init__(self, prepared: Prepared[ModelConfig]) -> None:
         super().__init__()
@@ -78,6 +81,7 @@ class ConceptModel(Shown, nn.Module, ABC):
         self.initial_normalization = prepared.observed
         self.register_buffer("empty", prepared.embeddings[0].clone())
         self.register_buffer("training_embeddings", prepared.embeddings[1:].clone())
+        self.register_buffer("frames", prepared.frames)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "view": None, "_perturb": None}  # functions of the domain
@@ -166,6 +170,9 @@ class ConceptModel(Shown, nn.Module, ABC):
         require(concept.knots == 1 or self.over_time, place, "1 knot for this model", concept.knots)
         if concept.adapter is not None:
             self.check_adapter(concept.adapter)
+        sizes = [None if frames is None else tuple(frames.shape) for frames in (self.frames, concept.frames)]
+        wanted = None if sizes[0] is None else sizes[0][1:]
+        require(sizes[1] == wanted, "key 'frames'", "none" if wanted is None else f"shape {wanted}", sizes[1])
 
     def check_settings(self, settings: InversionSettings) -> None:
         """Refuse settings that the model does not support; ``UserError`` with the key."""
@@ -202,10 +209,11 @@ class ConceptModel(Shown, nn.Module, ABC):
 
         Args:
             rows: row of the demonstration of each window ``(row,)``.
-            share: relative start of each window ``(row,)``, 0 to 1.
+            share: relative start of each window ``(row,)``, 0 to 1; ignored with places, whose shares depend on time.
             draw: generator of the perturbation, if configured.
         """
         plans = self.domain.plans
+        share = share if self.frames is None else torch.zeros_like(share)
         starts = demonstrations.starts(rows, share, plans.exponent(self.window), self.window, plans.at_rest)
         states, observed = demonstrations.windows(rows, starts, self.window)
         return self.perturbed(states.to(self.device), moved(observed, self.device), draw)
@@ -222,7 +230,7 @@ class ConceptModel(Shown, nn.Module, ABC):
         """
         raise NotImplementedError(f"{type(self).__name__}: an invertible model defines losses")
 
-    def products(self, states: Tensor, observed: Observed, draws: Draws | None, loss: str) -> Tensor | None:
+    def products(self, states: Tensor, observed: Observed, frames: Tensor | None, draws: Draws | None, loss: str) -> Tensor | None:
         """Inner products of the branches of all training concepts; ``None`` for a model without a composed denoiser.
 
         See :meth:`ftl_lightning.igm.model.DiffusionModel.branch_products`.
@@ -275,6 +283,23 @@ class ConceptModel(Shown, nn.Module, ABC):
             )
         return self.training_embeddings[self.config.training_concepts.index(text)]
 
+    def compositions(self, rows: slice | Tensor = slice(None)) -> Composition:
+        """Training concepts, each with weight 1: ``(row, 1, ...)``."""
+        embeddings = self.training_embeddings[rows, None, None]
+        frames = None if self.frames is None else self.frames[rows, None]
+        return Composition(embeddings, torch.ones(embeddings.shape[:2], device=self.device), frames=frames)
+
+    def __getitem__(self, text: str) -> Composition:
+        """A training concept, with weight 1; ``UserError`` for an unknown text."""
+        self.concept(text)
+        return self.compositions(slice(self.config.training_concepts.index(text), None)).row(0)
+
+    def frames_of(self, demonstrations: Demonstrations) -> Tensor | None:
+        """Frames of each concept of the demonstrations ``(concept, place, horizon)``; ``None`` for a model without places."""
+        if self.frames is None:
+            return None
+        return frames_of(demonstrations, self.horizon, self.config.places, self.frames.cpu()).to(self.device)
+
     def points(self) -> list[Point]:
         """Embeddings of the empty concept and the training concepts."""
         training = zip(self.config.training_concepts, self.training_embeddings, strict=True)
@@ -292,16 +317,34 @@ class ConceptModel(Shown, nn.Module, ABC):
         """Training windows with the present state perturbed, if configured."""
         return (states, observed) if self._perturb is None else self._perturb(states, observed, draw)
 
-    def encode(self, states: Tensor, observed: Observed) -> Tensor:
-        """Map behaviour ``(sample, horizon, state)`` in the domain's units to the network's inputs."""
+    def encode(self, states: Tensor, observed: Observed, frames: Tensor | None = None) -> Tensor:
+        """Map behaviour ``(sample, horizon, state)`` in the domain's units to the network's inputs.
+
+        ``frames``, shares ``(sample, place, horizon)`` or ``(1, place, horizon)``, subtract what observed places explain.
+        """
+        if frames is not None:
+            states = states - shift(frames, self.config.places, observed, states.shape[2])
         if self.view is not None:
             states = self.view.encode(states, observed)
         return self.normalization.encode(states)
 
-    def decode(self, normalised: Tensor, observed: Observed) -> Tensor:
+    def decode(self, normalised: Tensor, observed: Observed, frames: Tensor | None = None) -> Tensor:
         """The inverse of :meth:`encode`."""
         states = self.normalization.decode(normalised)
-        return states if self.view is None else self.view.decode(states, observed)
+        if self.view is not None:
+            states = self.view.decode(states, observed)
+        return states if frames is None else states + shift(frames, self.config.places, observed, states.shape[2])
+
+    def frames_by_plan(self, compositions: Sequence[Composition], count: int) -> Tensor | None:
+        """Frames of ``count`` plans of each composition ``(composition * count, place, horizon)``; ``None`` without places.
+
+        Compositions without frames have the mean of the training concepts'.
+        """
+        if self.frames is None:
+            return None
+        mean = self.frames.mean(dim=0)
+        every = [mean if (frame := each.uncomposed.frame) is None else frame.to(mean) for each in compositions]
+        return torch.stack(every).repeat_interleave(count, dim=0)
 
     def known_states(self, observed: Observed) -> Tensor | None:
         """Known states of plans ``(sample, horizon, state)`` in the domain's units, NaN where unknown; ``None`` without any.

@@ -39,6 +39,8 @@ class ModelConfig(Sizes):
         perturb: whether training perturbs the present state, see :class:`~ftl_lightning.domains.domain.View`.
         image_encoder: arguments of the image encoders, see :class:`~ftl_lightning.networks.image_encoder.ImageEncoder`.
         feature_dropout: dropout probability of observed vectors by name (0 after normalisation) in training.
+        places: columns of the state in the same frame as observed features that plans follow, by feature, in a user's data; see
+            :func:`~ftl_lightning.data.places.places`.
         metrics: metrics of plans for a user's data, see :mod:`ftl_lightning.domains.from_file`.
         training: training options, for the record.
 
@@ -53,6 +55,7 @@ class ModelConfig(Sizes):
     perturb: bool = False
     image_encoder: Mapping[str, Any] = field(default_factory=dict)
     feature_dropout: Mapping[str, float] = field(default_factory=dict)
+    places: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
     metrics: Mapping[str, float] = field(default_factory=dict)
     training: Mapping[str, Any] = field(default_factory=dict)
 
@@ -124,6 +127,7 @@ class Prepared(Generic[C]):
         normalization: normalisation of states.
         embeddings: concept embeddings ``(1 + training concepts, n)``, the empty concept first.
         observed: normalisation of the observed vectors; ``None`` without any.
+        frames: frames of the training concepts ``(training concept, place, horizon)``; ``None`` without places.
     """
 
     config: C
@@ -131,11 +135,13 @@ class Prepared(Generic[C]):
     normalization: Normalization
     embeddings: Tensor
     observed: Normalization | None = None
+    frames: Tensor | None = None
 
     def configured(self, kind: type[K], **options: Any) -> "Prepared[K]":
         """Copy with the configuration of a method's network."""
         known = {field.name: getattr(self.config, field.name) for field in fields(self.config)}
-        return Prepared(kind(**known | options), self.domain, self.normalization, self.embeddings, self.observed)
+        parts = (self.domain, self.normalization, self.embeddings, self.observed, self.frames)
+        return Prepared(kind(**known | options), *parts)
 
     def embedded(self, embeddings: Tensor) -> "Prepared[C]":
         """Copy with other embeddings ``(1 + training concepts, n)``."""
@@ -151,4 +157,5 @@ def blank(config: K, domain: Domain) -> Prepared[K]:
         Normalization(states, states),
         torch.zeros(1 + len(config.training_concepts), config.concept_dim),
         Normalization(vectors, vectors) if config.measured_dim else None,
+        torch.zeros(len(config.training_concepts), len(config.places), config.horizon) if config.places else None,
     )

@@ -3,6 +3,7 @@
 import copy
 import functools
 import math
+import operator
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -17,7 +18,9 @@ from torch import Tensor
 
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import Feature, Observed
+from ftl_lightning.data.kinds import LINEAR
 from ftl_lightning.data.normalization import Normalization
+from ftl_lightning.data.places import frames_of, places, shift
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.tasks import WITHOUT_WEIGHT, EvaluationTask
 from ftl_lightning.igm.composition import Composition
@@ -87,6 +90,8 @@ class Pretraining(pl.LightningModule, ABC, Generic[M]):
     """Grouped options ``'group.option'`` by flat name, see :func:`ftl_lightning.services.validation.groups_of`."""
     form: str = ""
     """Suffix of the method's name in tables, if it has several forms."""
+    framed: ClassVar[bool] = False
+    """Whether plans are learned relative to observed places, see :class:`~ftl_lightning.data.places.Frames`."""
     variant: str = ""
     """Variant of the method in tables."""
     concepts: tuple[str, ...] = ()
@@ -167,16 +172,24 @@ class Pretraining(pl.LightningModule, ABC, Generic[M]):
         concepts = data.domain.concepts.training
         embeddings = data.encoder((EMPTY, *concepts))
         check_different(concepts, embeddings[1:])
-        name = self.hparams["view"] or data.view
+        name, known = self.hparams["view"] or data.view, self._places(data)
         view = find_view(data.domain, name)
         features = data.domain.observed if view is None else view.features
         observed: Observed
-        if view is None:
+        frames = None
+        if known:
+            order = list(dict.fromkeys(data.training.concepts))
+            frames = frames_of(data.training, data.horizon, known)[[order.index(text) for text in concepts]]
+        if view is None and frames is None:
             states, observed = data.training.states, data.training.every_observation
         else:
             windows = data.every_window()
-            states, observed = windows.states[:, :: self.stride], view.observe(windows.observed)
-            states = view.encode(states, windows.observed)
+            states, observed = windows.states, windows.observed
+            if frames is not None:
+                states = states - shift(frames[windows.concepts], known, observed, states.shape[2])
+            states = states[:, :: self.stride]
+            if view is not None:
+                states, observed = view.encode(states, observed), view.observe(observed)
         with torch.device("meta"):  # for its size alone
             image_dim = ImageEncoders(features, self.image_encoder).size
         config = ModelConfig(
@@ -193,6 +206,7 @@ class Pretraining(pl.LightningModule, ABC, Generic[M]):
             image_encoder=self.image_encoder,
             feature_dropout=check_dropout(self.feature_dropout, features),
             plane=view.plane if view else (),
+            places=known,
             metrics=dict(data.metrics),
             training={
                 "model": {key: value for key, value in self.hparams.items() if key != "output" and not key.startswith("_")},
@@ -211,7 +225,7 @@ class Pretraining(pl.LightningModule, ABC, Generic[M]):
                 vectors = Normalization.fit(joined_vectors(observed, features), config.entities, resolution)
                 if config.state_columns and (view is None or view.same_columns):  # else plans have another scale
                     vectors.share(config.state_columns, normalization)
-            self.model = self.build(Prepared(config, data.domain, normalization, embeddings, vectors), data)
+            self.model = self.build(Prepared(config, data.domain, normalization, embeddings, vectors, frames), data)
             self.model.examples = data.examples
             self.teaching.check_taught(self.domain, self.model.images)
         self.raw = copy.deepcopy(self.model)
@@ -220,6 +234,14 @@ class Pretraining(pl.LightningModule, ABC, Generic[M]):
             # A model that memorises: the optimiser still needs a parameter to count steps.
             self.unused = torch.nn.Parameter(torch.zeros(()))
         self.model.requires_grad_(False).eval()
+
+    def _places(self, data: PretrainingData) -> dict[str, tuple[int, ...]]:
+        """Observed places of a user's data that plans follow in linear columns, as long as a plan is a whole demonstration."""
+        if not self.framed or data.examples is None or int(data.training.lengths.max()) > data.horizon:
+            return {}
+        kinds = dict(enumerate(data.domain.plans.kinds))
+        known = places(data.training, data.horizon)
+        return {name: columns for name, columns in known.items() if {kinds.get(column, LINEAR) for column in columns} == {LINEAR}}
 
     def train(self, mode: bool = True) -> Self:
         """Switch modes; the EMA model is always in evaluation mode."""
@@ -330,9 +352,9 @@ class Pretraining(pl.LightningModule, ABC, Generic[M]):
         """Composition for a task; ``None`` if it needs a learned concept."""
         if task.learned:
             return None
-        embeddings = torch.stack([self.model.concept(text)[None] for text in (*task.texts, *task.without)])
-        weights = [self.guidance] * len(task.texts) + [WITHOUT_WEIGHT] * len(task.without)
-        return Composition(embeddings, embeddings.new_tensor(weights))
+        parts = [self.guidance * self.model[text] for text in task.texts]
+        parts += [WITHOUT_WEIGHT * self.model[text] for text in task.without]
+        return functools.reduce(operator.add, parts)
 
     def demonstrated(self, concept: str) -> Demonstrations | None:
         """Demonstrations of a learned concept: ``None`` in pretraining."""

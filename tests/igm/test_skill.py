@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.data.demonstrations import Demonstrations, concatenate
+from ftl_lightning.data.energy import FEATURES, among, apart
 from ftl_lightning.data.normalization import Normalization
 from ftl_lightning.data.pinned import Pinned
 from ftl_lightning.data.references import NAMES, SHIFTED, WARPED
@@ -21,9 +22,9 @@ from ftl_lightning.igm.diffusion import cosine_alpha_bar
 from ftl_lightning.igm.explanation import formula
 from ftl_lightning.igm.forms.choice import _by_skill
 from ftl_lightning.igm.forms.combination import Combination
-from ftl_lightning.igm.forms.skill import LeftOut
+from ftl_lightning.igm.forms.skill import Drawn, LeftOut
 from ftl_lightning.igm.samplers import SAMPLERS, Sampling
-from ftl_lightning.igm.settings import ADAPTED, COMBINED, MIXED, MODES, NOT_LEARNED, ONE, InversionSettings
+from ftl_lightning.igm.settings import ADAPTED, COMBINED, NOT_LEARNED, ONE, InversionSettings
 from ftl_lightning.methods.ftl_igm.model import DiffusionConfig, GenerativeModel
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.training.model_config import Prepared
@@ -72,7 +73,7 @@ def test_the_loss_of_a_combination_is_the_quadratic_function_of_its_weights(mode
     draw = torch.Generator().manual_seed(1)
     draws = net.draws(6, 1.0, draw)
     states, observed = net.windows(few, torch.zeros(6, dtype=torch.int64), torch.zeros(6), draw)
-    products = net.products(states, observed, draws, "clean")
+    products = net.products(states, observed, None, draws, "clean")
     weights = torch.tensor([0.7, -0.4, 1.3])
     composition = Composition(net.training_embeddings[None, :, None], weights[None])
     direct = net.losses(states, observed, composition, draws, "clean")[0]
@@ -153,15 +154,14 @@ def test_forms_that_learn_no_embedding_are_kept_sampled_and_composed(model: FewS
 def test_the_form_of_ones_own_data_is_chosen_by_skill_beside_references(model: FewShot) -> None:
     learned = model.learn(walks("between", 4), name="between")
     choice = learned.concept.choice
-    assert set(choice.skills) == {COMBINED, ONE, ADAPTED, MIXED, MODES, KNOWN, *NAMES}
-    assert choice.form in (SHIFTED, WARPED)  # an untrained model is no rival
-    assert "no learned form is as good on left-out demonstrations" in choice.because
+    assert set(choice.skills) == {COMBINED, ONE, ADAPTED, KNOWN, *NAMES}
+    assert choice.form in NOT_LEARNED  # an untrained model is no rival
+    assert learned.concept.share == 1
+    assert "no learned form adds to it on left-out demonstrations" in choice.because
     assert all(0 < skill < 2 for skill in choice.skills.values())
     assert f"{choice.form} has skill {choice.skills[choice.form]:.2f} on left-out demonstrations (without learning: " in str(
         learned.quality
     )
-    two = model.learn(walks("between", 2), name="between").concept.choice
-    assert MODES not in two.skills
     assert model.learn(walks("between", 1), name="between").concept.choice.form == ONE
 
 
@@ -185,9 +185,77 @@ def test_check_tries_sums_of_training_concepts(model: FewShot) -> None:
 def test_without_places_a_shifted_demonstration_is_a_copy_and_is_not_chosen(model: FewShot) -> None:
     few = walks("between", 4)
     left = LeftOut(model.model, few, model.model.examples)
-    scores = {name: torch.full((4,), 2.0) for name in (COMBINED, ONE)}
-    references = {name: torch.ones(4) for name in NAMES} | {SHIFTED: torch.full((4,), 0.5)}
-    assert _by_skill(scores, references, left)[0] == SHIFTED
+
+    def drawn(distance: float) -> Drawn:
+        values = [torch.zeros(4, 2, 3) for _ in FEATURES]  # as if no mixture added spread
+        return Drawn(values, torch.full((4,), distance), torch.zeros(4))
+
+    learned = {name: drawn(9.0) for name in (COMBINED, ONE)}
+    references = {name: drawn(5.0) for name in NAMES} | {SHIFTED: drawn(2.0), WARPED: drawn(3.0)}
+    assert _by_skill(learned, references, left)[1:3] == (SHIFTED, 1.0)
     left.setting = replace(left.setting, places={})
-    assert _by_skill(scores, references, left)[0] == WARPED
-    assert _by_skill({name: score / 4 for name, score in scores.items()}, references, left)[0] == COMBINED
+    assert _by_skill(learned, references, left)[1:3] == (WARPED, 1.0)
+    form, _, share, because = _by_skill({name: drawn(1.0) for name in learned}, references, left)
+    assert (form, share) == (COMBINED, 0)
+    assert "the best reference, the shifted demonstration, has" in because
+
+
+def test_the_share_of_a_mixture_is_that_with_the_best_score(model: FewShot) -> None:
+    few = walks("between", 4)
+    left = LeftOut(model.model, few, model.model.examples)
+    truth = left.features(left.truth)
+    noise = torch.Generator().manual_seed(0)
+
+    def around(offset: float) -> Drawn:
+        values = [each[:, None] + offset + torch.randn(4, 16, each.shape[1], generator=noise) for each in truth]
+        far = [apart(samples, real) for samples, real in zip(values, truth, strict=True)]
+        return Drawn(values, left._mean(far), left._mean([among(samples) for samples in values]))
+
+    low, high = around(-1.0), around(1.0)
+    scores = left.mixed(low, high).mean(dim=1)
+    assert scores.argmin() == 5
+    torch.testing.assert_close(left.mixed(low, high)[[0, -1]].float(), torch.stack((low.score, high.score)))
+    both = [torch.cat(pair, dim=1) for pair in zip(low.values, high.values, strict=True)]
+    direct = left._mean([apart(samples, real) for samples, real in zip(both, truth, strict=True)])
+    assert float(scores[5]) < float(direct.mean())
+
+
+def test_a_mixture_has_its_share_of_samples_without_the_model(model: FewShot) -> None:
+    concept = model.learn(walks("between", 4), name="between", form=SHIFTED).concept
+    half = model._learned(replace(concept, share=0.25))
+    half.save("half.safetensors")
+    fresh = walks("between", 40, 7).initial_states
+    made, mixed = (model.sample(each, observed=fresh).states for each in (model._learned(concept), model.load("half.safetensors")))
+    assert int((made == mixed).all(dim=2).all(dim=1).sum()) == 10
+    assert torch.equal(mixed[:, 0, :2], fresh.observed["start"])
+
+
+def test_plans_are_learned_relative_to_places_and_come_back(tmp_path: Path) -> None:
+    demonstrations = concatenate([walks(name, 12) for name in ENDS if name != "between"])
+    demonstrations.save(tmp_path / "walks.npz")
+    succeed(
+        *("fit", "--config", "conf/own.yaml", "--data.demonstrations", str(tmp_path / "walks.npz"), "--trainer.max_steps", "20"),
+        *("--data.metrics", "{}", "--trainer.logger.save_dir", str(tmp_path)),
+    )
+    model = FewShot.from_pretrained(tmp_path / "own" / "fit" / "pretrained")
+    net, few = model.model, walks("between", 4)
+    assert dict(net.config.places) == {"start": (0, 1)}
+    assert net.frames.shape == (3, 1, 12)
+    torch.testing.assert_close(net.frames[:, 0, 0], torch.ones(3), atol=0.05, rtol=0)
+    frames = net.frames_of(few)
+    observed = few.initial_states.observed
+    encoded = net.encode(few.states, observed, frames)
+    torch.testing.assert_close(net.decode(encoded, observed, frames), few.states, atol=1e-5, rtol=0)
+    learned = model.learn(few, name="between", form=ONE)
+    learned.save("c.safetensors")
+    fresh = walks("between", 3, 7).initial_states
+    plans = model.sample(learned, observed=fresh).states
+    assert torch.equal(plans, model.sample(model.load("c.safetensors"), observed=fresh).states)
+    far = {"start": fresh.observed["start"] + 100.0}
+    moved = model.sample(learned, observed=far).states - plans
+    assert float(moved[:, -1, :2].mean()) > 50  # the end follows the start, as in the demonstrations
+    both = model["up"] + learned
+    share = 1 / float(1 + learned.weights.clamp(min=0).sum())
+    torch.testing.assert_close(both.frame, share * model["up"].frame + (1 - share) * learned.concept.frames)
+    with pytest.raises(UserError, match="key 'frames': expected shape"):
+        net.check_sizes(replace(learned.concept, frames=None))

@@ -8,14 +8,14 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.data.demonstrations import Demonstrations, concatenate
-from ftl_lightning.data.references import WARPED, Reference, Setting
+from ftl_lightning.data.references import SHIFTED, Reference, Setting
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import KNOWN, SKILL, Choice, Concept
 from ftl_lightning.igm.forms.combination import Combination
 from ftl_lightning.igm.forms.leave_one_out import learned_from, quickly, relative_losses
 from ftl_lightning.igm.forms.modes import Modes, even_stretch
 from ftl_lightning.igm.forms.quality import Quality, measured
-from ftl_lightning.igm.forms.skill import LeftOut
+from ftl_lightning.igm.forms.skill import SHARES, Drawn, LeftOut
 from ftl_lightning.igm.inversion import Inversion, Tell, Watch, invert
 from ftl_lightning.igm.model import Invertible
 from ftl_lightning.igm.settings import ADAPTED, AUTO, COMBINED, MIXED, MODES, NOT_LEARNED, ONE, PAPER, UNSAID, InversionSettings
@@ -25,8 +25,8 @@ RANK, RATE, ADAPTER_STEPS = 1, 3e-3, 120
 """Default rank, learning rate and steps of adapters."""
 SKILLED: Mapping[str, Any] = {"adapter": 8, "adapter_learning_rate": 6e-3, "components": 1, "omega": 1.0, "samples": 16}
 SKILLED_STEPS = 200
-"""Settings of the adapter that :func:`by_skill` learns, and steps of the adapter and of modes."""
-SIMPLEST = (COMBINED, ONE, ADAPTED, MIXED, MODES)
+"""Settings and steps of the adapter that :func:`by_skill` learns."""
+SIMPLEST = (COMBINED, ONE, ADAPTED)
 """Learned forms of :func:`by_skill`, the simplest first."""
 MODE_SAMPLES, MODE_STEPS = 16, 400
 """Noised demonstrations a step, and maximum number of steps, of modes without an adapter."""
@@ -100,12 +100,15 @@ def _with_modes(
 ) -> dict[str, Concept]:
     """The first concepts with a mode for each demonstration, learned without early stopping, since samples depend on modes."""
     alone = settings.from_one_start(form=PAPER, modes=1, adapter=0, samples=MODE_SAMPLES, tolerance=None)
-    sets = learned_from(model, demonstrations, [[row] for row in range(len(demonstrations))], alone, min(steps, MODE_STEPS), tell)
+    rows, names = range(len(demonstrations)), list(first)
+    frames = model.frames_of(demonstrations)
+    frames = None if frames is None else frames[[names.index(text) for text in demonstrations.concepts]]
+    sets = learned_from(model, demonstrations, [[row] for row in rows], alone, min(steps, MODE_STEPS), tell, frames)
     formed = {}
     for name, concept in first.items():
-        rows = [row for row, text in enumerate(demonstrations.concepts) if text == name]
-        modes = Modes(sets.embeddings[rows].cpu(), sets.weights[rows].cpu(), mixed=False)
-        formed[name] = replace(concept, modes=modes if len(rows) > 1 else None)
+        some = [row for row, text in enumerate(demonstrations.concepts) if text == name]
+        modes = Modes(sets.embeddings[some].cpu(), sets.weights[some].cpu(), mixed=False)
+        formed[name] = replace(concept, modes=modes if len(some) > 1 else None)
     return formed
 
 
@@ -132,10 +135,16 @@ def _adapted(
     return concepts
 
 
-def combined(model: Invertible, weights: Tensor) -> Composition:
-    """Composition ``(K, ...)`` of the training concepts with weights ``(training concept,)`` other than 0; at least one of them."""
+def combined(model: Invertible, weights: Tensor, frames: Tensor | None = None) -> Composition:
+    """Composition ``(K, ...)`` of the training concepts with weights ``(training concept,)`` other than 0; at least one of them.
+
+    The frames are those of the training concepts, or ``frames (place, horizon)``.
+    """
     used = weights.nonzero()[:, 0] if weights.any() else torch.zeros(1, dtype=torch.int64)
-    return Composition(model.training_embeddings.cpu()[used][:, None].clone(), weights[used].clone())
+    known = model.compositions(used)
+    frames = known.frames if frames is None else frames[None, None]
+    every = None if frames is None else frames[:, 0].expand(len(used), -1, -1).cpu()
+    return Composition(known.embeddings[:, 0].cpu(), weights[used].clone(), frames=every)
 
 
 def _combined(model: Invertible, combination: Combination | None, first: Concept) -> Concept:
@@ -144,7 +153,7 @@ def _combined(model: Invertible, combination: Combination | None, first: Concept
         raise UserError("model.form: expected a diffusion model for a combination of training concepts, found another method")
     composition = combined(model, combination.weights)
     origin = replace(first.origin, weights="learned", loss=combination.loss)
-    return Concept(composition.embeddings, composition.weights, origin)
+    return Concept(composition.embeddings, composition.weights, origin, frames=first.frames)
 
 
 def _made(model: Invertible, demonstrations: Demonstrations, form: str, first: Concept) -> Concept:
@@ -158,8 +167,8 @@ def by_skill(
 ) -> Concept:
     """The concept in the form with the highest skill, see :class:`~ftl_lightning.igm.forms.skill.LeftOut`.
 
-    The simplest learned form whose skill is within one standard error of the best is taken. If a shifted or a warped demonstration,
-    which needs no learning, has a higher skill, that reference is the form.
+    Each learned form is scored alone and in mixtures with samples that need no learning, in the share with the best score. The
+    simplest form whose skill is within one standard error of the best is taken; without a mixture, if that is within one, too.
 
     Args:
         demonstrations: demonstrations of one concept.
@@ -169,56 +178,66 @@ def by_skill(
     if len(demonstrations) < 2:
         return replace(first, choice=Choice(ONE, "there is a single demonstration", {}))
     left, seed = LeftOut(model, demonstrations, model.examples), settings.seed
-    whole, scores = {ONE: first}, dict[str, Tensor]()
+    whole, drawn = {ONE: first}, dict[str, Drawn]()
     combination = Combination.of(model, demonstrations, settings)
     if combination is not None:
         assert combination.folds is not None
         whole[COMBINED] = _combined(model, combination, first)
-        scores[COMBINED] = left.score([combined(model, combination.folds[row]) for row in left.rows], seed)
+        folds = zip(left.rows, left.frames, strict=True)
+        drawn[COMBINED] = left.drawn([combined(model, combination.folds[row], frames) for row, frames in folds], seed)
         alone = torch.zeros_like(combination.weights)
         alone[combination.best] = 1
-        scores[KNOWN] = left.score([combined(model, alone)] * len(left.rows), seed)
+        drawn[KNOWN] = left.drawn([combined(model, alone)] * len(left.rows), seed)
     parts = left.parts()
     sets = learned_from(model, demonstrations, left.others, quickly(settings), steps, tell)
-    scores[ONE] = left.score([sets.row(fold) for fold in range(len(parts))], seed)
+    drawn[ONE] = left.drawn([sets.row(fold) for fold in range(len(parts))], seed)
     labelled = concatenate([replace(part, concepts=(f"{fold}",) * len(part)) for fold, part in enumerate([demonstrations, *parts])])
     adapted, *without = _adapted(model, labelled, settings.changed(**SKILLED), steps, False, tell, by_sample=True).values()
     whole[ADAPTED] = replace(adapted, origin=replace(first.origin, loss=adapted.origin.loss))
-    scores[ADAPTED] = left.score([concept.composition for concept in without], seed)
-    if len(demonstrations) > 2:
-        few, name = min(steps, SKILLED_STEPS), first.origin.name
-        whole[MODES] = _with_modes(model, demonstrations, settings, few, {name: first}, tell)[name]
-        modes = whole[MODES].modes
-        assert modes is not None
-        kept = [replace(modes, embeddings=modes.embeddings[rows], weights=modes.weights[rows]) for rows in left.others]
-        for kind, mixed in ((MODES, False), (MIXED, True)):
-            whole[kind] = replace(whole[MODES], modes=replace(modes, mixed=mixed, stretch=even_stretch(len(modes))))
-            part = [replace(each, mixed=mixed, stretch=even_stretch(len(each))) for each in kept]
-            scores[kind] = left.score([replace(first, modes=each).composition for each in part], seed)
+    drawn[ADAPTED] = left.drawn([concept.composition for concept in without], seed)
     references = left.references(first.composition.uncomposed, seed)
-    every = scores | references
-    form, because = _by_skill({name: scores[name] for name in SIMPLEST if name in whole}, references, left)
-    chosen = _made(model, demonstrations, form, first) if form in references else whole[form]
-    numbers = {f"{SKILL}{name}": round(left.skill(value.mean()), 4) for name, value in every.items()}
+    form, name, share, because = _by_skill({name: drawn[name] for name in SIMPLEST if name in whole}, references, left)
+    chosen = whole[form]
+    if share:
+        chosen = replace(_made(model, demonstrations, name, chosen), share=share)
+    numbers = {f"{SKILL}{name}": round(left.skill(value.score.mean()), 4) for name, value in (drawn | references).items()}
+    called = form if not share else name if share == 1 else f"{form} and {name}"
+    if 0 < share < 1:
+        score = left.mixed(drawn[form], references[name])[SHARES.tolist().index(share)]
+        numbers[f"{SKILL}{called}"] = round(left.skill(score.mean()), 4)
     composing = None if COMBINED not in whole or form == COMBINED else (whole[COMBINED].embeddings, whole[COMBINED].weights)
-    keep = composing is not None and float(scores[COMBINED].mean()) <= float(scores[ONE].mean())
-    return replace(chosen, choice=Choice(form, because, numbers), composing=composing if keep else None)
+    keep = composing is not None and float(drawn[COMBINED].score.mean()) <= float(drawn[ONE].score.mean())
+    return replace(chosen, choice=Choice(called, because, numbers), composing=composing if keep else None)
 
 
-def _by_skill(learned: Mapping[str, Tensor], references: Mapping[str, Tensor], left: LeftOut) -> tuple[str, str]:
-    """Form and reason, by the scores ``(fold,)`` of learned forms, the simplest first, and of references; the lowest is best."""
-    means = {name: float(score.mean()) for name, score in {**learned, **references}.items()}
-    best = min(learned, key=lambda name: means[name])
-    form = next(name for name, score in learned.items() if _within(score, learned[best]))
-    offered = NOT_LEARNED if left.setting.places else (WARPED,)  # without places a shifted demonstration is a copy
-    rival, other = min(references, key=lambda name: means[name]), min(offered, key=lambda name: means[name])
-    skill = {name: f"{left.skill(mean):.2f}" for name, mean in means.items()}
-    if means[other] < means[form]:
-        return other, f"no learned form is as good on left-out demonstrations: {form} has skill {skill[form]}, this {skill[other]}"
-    said = f"skill {skill[form]} on left-out demonstrations"
-    if means[rival] < means[form]:
-        return form, f"{said}; the {rival} has {skill[rival]} without learning"
-    return form, f"{said}; the best reference, the {rival}, has {skill[rival]}"
+def _by_skill(learned: Mapping[str, Drawn], references: Mapping[str, Drawn], left: LeftOut) -> tuple[str, str, float, str]:
+    """Learned form, reference, share of the reference in the samples, and reason, by scores on left-out demonstrations.
+
+    Args:
+        learned: samples of learned forms, the simplest first.
+    """
+    offered = [name for name in NOT_LEARNED if left.setting.places or name != SHIFTED]  # without places this is a copy
+    mixtures = {(form, name): left.mixed(drawn, references[name]) for form, drawn in learned.items() for name in offered}
+    form, name = min(mixtures, key=lambda pair: float(mixtures[pair].mean(dim=1).min()))
+    mixture = mixtures[form, name]  # (share, fold)
+    number = int(mixture.mean(dim=1).argmin())
+    alone = [form for form, drawn in learned.items() if _within(drawn.score, mixture[number])]
+    if alone:
+        form, number = alone[0], 0
+    rival = min(references, key=lambda name: float(references[name].score.mean()))
+    scores = (mixture[number] if number else learned[form].score, learned[form].score, references[rival].score)
+    skills, share = [f"{left.skill(score.mean()):.2f}" for score in scores], round(float(SHARES[number]), 1)
+    if share == 1:
+        return (
+            form,
+            name,
+            share,
+            f"no learned form adds to it on left-out demonstrations: skill {skills[0]}, {form} has {skills[1]}",
+        )
+    said = f"skill {skills[0]} on left-out demonstrations"
+    if share:
+        said = f"{said}, {skills[1]} without the {share:.0%} of samples that are {name}, not learned"
+    return form, name, share, f"{said}; the best reference, the {rival}, has {skills[2]}"
 
 
 def _within(score: Tensor, best: Tensor) -> bool:

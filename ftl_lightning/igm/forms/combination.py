@@ -62,12 +62,12 @@ class Combination:
             The combination; ``None`` for a model without composed denoiser.
         """
         draw = generator(model.device, settings.seed, 6)
-        products = []
+        frames, products = model.frames_of(demonstrations), []
         for row in range(len(demonstrations)):
             draws = model.draws(SAMPLES, settings.loss.timestep_power, draw)
             share = torch.rand(SAMPLES, generator=draw, device=model.device).cpu()
             states, observed = model.windows(demonstrations, torch.full((SAMPLES,), row), share, draw)
-            part = model.products(states, observed, draws, settings.loss.kind)
+            part = model.products(states, observed, frames, draws, settings.loss.kind)
             if part is None:
                 return None
             products.append(part.double().mean(dim=0).cpu())

@@ -10,7 +10,7 @@ from ftl_lightning.data.check import numbered
 from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.data.features import Observed
 from ftl_lightning.igm.composition import Composition
-from ftl_lightning.igm.inversion import Tell, invert
+from ftl_lightning.igm.inversion import Inversion, Tell, invert
 from ftl_lightning.igm.model import Draws, Invertible
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.igm.settings import PAPER, InversionSettings
@@ -69,7 +69,7 @@ class _Noised:
         return losses.unflatten(1, (self.demonstrations, -1)).mean(dim=2).cpu()
 
     def empty(self, concepts: Composition) -> Tensor:
-        """Unconditional losses ``(1, demo)``; only the shape of ``concepts`` is used."""
+        """Unconditional losses ``(1, demo)`` in mean frames; only the shape of ``concepts`` is used."""
         nothing = Composition(concepts.embeddings[:1], torch.zeros_like(concepts.weights[:1]))
         return self.losses(nothing).clamp(min=1e-12)
 
@@ -96,7 +96,7 @@ def relative_losses(
     losses, size = [], max(1, TOGETHER // len(noised.states))
     for first in range(0, len(concepts.weights), size):
         chosen = slice(first, first + size)
-        losses.append(noised.losses(Composition(concepts.embeddings[chosen], concepts.weights[chosen])))
+        losses.append(noised.losses(concepts.row(chosen)))
         tell(len(losses[-1]))
     return torch.cat(losses) / empty
 
@@ -108,18 +108,16 @@ def generated_loss(model: Invertible, demonstrations: Demonstrations, settings: 
     Behaviour of training concepts is generated from the windows' initial states. A concept learned as well as in pretraining has
     about this loss. The median over at most :data:`COMPARED` training concepts is returned.
     """
-    embeddings = model.training_embeddings[:, None, None]
-    chosen = torch.linspace(0, len(embeddings) - 1, min(COMPARED, len(embeddings))).round().long()
-    ones = torch.ones(1, 1, device=model.device)
+    whole = len(model.training_embeddings)
+    chosen = torch.linspace(0, whole - 1, min(COMPARED, whole)).round().long()
     noised = _Noised.of(model, demonstrations, settings, _samples(settings))
     means = []
     for number in chosen.tolist():
-        concept = Composition(embeddings[number : number + 1], ones)
-        alone = Composition(concept.embeddings[0], concept.weights[0])
+        concept = model.compositions(slice(number, number + 1))
         draws = [generator(model.device, settings.seed, 5, number)]
-        plans = model.sample([alone], len(noised.states), GENERATED, draws, noised.seen)[0]
+        plans = model.sample([concept.row(0)], len(noised.states), GENERATED, draws, noised.seen)[0]
         means.append(noised.losses(concept, plans).mean())
-    empty = noised.empty(Composition(embeddings[:1], ones))
+    empty = noised.empty(model.compositions(slice(1)))
     return float(torch.stack(means).median() / empty.mean())
 
 
@@ -209,15 +207,22 @@ def learned_from(
     settings: InversionSettings,
     steps: int,
     tell: Tell = lambda loss: None,
+    frames: Tensor | None = None,
 ) -> Composition:
     """Learn one set of embeddings for each subset, in one batch: ``(subset, K, ...)`` on the model's device.
 
     Args:
         settings: settings in the paper's form.
+        frames: frames of each subset ``(subset, place, horizon)``; ``None`` for those of its demonstrations.
     """
     parts = [replace(demonstrations.rows(list(rows)), concepts=(f"{number}",) * len(rows)) for number, rows in enumerate(chosen)]
-    sets = list(invert(model, concatenate(parts), settings, steps, tell).values())
-    every = Composition(torch.stack([each.embeddings for each in sets]), torch.stack([each.weights for each in sets]))
+    start = Inversion(model, concatenate(parts), settings, frames=frames).to(model.device)
+    sets = [concept.composition for concept in invert(model, start.demonstrations, settings, steps, tell, start=start).values()]
+    every = Composition(
+        torch.stack([each.embeddings for each in sets]),
+        torch.stack([each.weights for each in sets]),
+        frames=None if start.frames is None else torch.stack([each.frames for each in sets if each.frames is not None]),
+    )
     return every.to(model.device)
 
 

@@ -1,13 +1,13 @@
 """Skill of samples on left-out demonstrations: an energy score, scaled by that of training behaviour and of fresh behaviour."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from ftl_lightning.data.demonstrations import Demonstrations
-from ftl_lightning.data.energy import PathFeatures, ceiling
+from ftl_lightning.data.energy import PathFeatures, among, apart, ceiling
 from ftl_lightning.data.features import moved
 from ftl_lightning.data.places import first_windows
 from ftl_lightning.data.references import NAMES, SHIFTED, Reference, Setting
@@ -25,6 +25,30 @@ SAMPLING = Sampling("dpm_solver", 10, 1.0)
 """Sampling of candidates."""
 
 
+SHARES = torch.arange(11, dtype=torch.float64) / 10
+"""Shares of samples that are made without the model, in mixtures."""
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """Samples for each left-out demonstration, and their mean distances, in units of the score.
+
+    Attributes:
+        values: features ``(fold, sample, n)`` of each kind.
+        apart: mean distance from the left-out demonstration ``(fold,)``.
+        among: mean distance between two samples ``(fold,)``.
+    """
+
+    values: Sequence[Tensor]
+    apart: Tensor
+    among: Tensor
+
+    @property
+    def score(self) -> Tensor:
+        """Energy score ``(fold,)``."""
+        return self.apart - self.among / 2
+
+
 class LeftOut:
     """Scores of candidates on left-out demonstrations of one concept, in the network's normalised columns.
 
@@ -40,6 +64,7 @@ class LeftOut:
     Attributes:
         rows: left-out demonstrations ``(fold,)``.
         others: rows of the other demonstrations, for each left-out one.
+        frames: frames ``(place, horizon)`` of the others, for each left-out demonstration; ``None`` for a model without places.
         fresh: score of fresh demonstrations, from the distances among the demonstrations; where places are observed, from those
             among the demonstrations moved to the places of each.
         setting: what the training concepts say about behaviour, for references.
@@ -49,6 +74,7 @@ class LeftOut:
         self.model, self.demonstrations = model, demonstrations
         self.rows = list(range(0, len(demonstrations), -(-len(demonstrations) // FOLDS)))
         self.others = [[row for row in range(len(demonstrations)) if row != out] for out in self.rows]
+        self.frames = [None if (frames := model.frames_of(part)) is None else frames[0].cpu() for part in self.parts()]
         self.setting = Setting.of(training, model.horizon)
         real = encoded(self.model, first_windows(training, model.horizon), training.initial_states)
         self.features = PathFeatures(real)
@@ -77,20 +103,34 @@ class LeftOut:
         """The demonstrations without each left-out one, ``(fold,)``."""
         return [self.demonstrations.rows(rows) for rows in self.others]
 
-    def score(self, compositions: Sequence[Composition], seed: int) -> Tensor:
-        """Scores ``(fold,)`` of samples of the compositions that were learned without each left-out demonstration."""
+    def drawn(self, compositions: Sequence[Composition], seed: int) -> Drawn:
+        """Samples of the compositions ``(fold,)`` that were learned without each left-out demonstration."""
         starts = self.demonstrations.initial_states.take(torch.tensor(self.rows).repeat_interleave(SAMPLES))
         draws = [generator("cpu", seed, 9, fold) for fold in range(len(self.rows))]
         sampling = replace(SAMPLING, steps=min(SAMPLING.steps, self.model.max_steps or SAMPLING.steps))
         together = [composition.to(self.model.device) for composition in compositions]
         plans = self.model.sample(together, SAMPLES, sampling, draws, moved(starts.observed, self.model.device)).cpu()
-        scores = self.features.scores(encoded(self.model, plans.flatten(0, 1), starts).unflatten(0, plans.shape[:2]), self.truth)
-        return (scores / self.unit).mean(dim=1)
+        values = [each.unflatten(0, plans.shape[:2]) for each in self.features(encoded(self.model, plans.flatten(0, 1), starts))]
+        far = [apart(samples, real) for samples, real in zip(values, self.features(self.truth), strict=True)]
+        return Drawn(values, self._mean(far), self._mean([among(samples) for samples in values]))
 
-    def references(self, like: Composition, seed: int) -> dict[str, Tensor]:
-        """Scores ``(fold,)`` of each reference that needs no learning, by name; ``like`` is any composition of the model."""
+    def _mean(self, distances: Sequence[Tensor]) -> Tensor:
+        """Mean over features of distances ``(fold,)``, in units of the score."""
+        scaled = [distance / unit for distance, unit in zip(distances, self.features.units, strict=True)]
+        return (torch.stack(scaled, dim=1) / self.unit).mean(dim=1)
+
+    def mixed(self, learned: Drawn, made: Drawn) -> Tensor:
+        """Scores ``(share, fold)`` of mixtures in which the :data:`SHARES` of the samples are of ``made``."""
+        both = zip(learned.values, made.values, strict=True)
+        between = self._mean([torch.cdist(first, second).mean(dim=(1, 2)) for first, second in both])
+        share = SHARES[:, None]
+        spread = (1 - share).square() * learned.among + share.square() * made.among + 2 * share * (1 - share) * between
+        return (1 - share) * learned.apart + share * made.apart - spread / 2
+
+    def references(self, like: Composition, seed: int) -> dict[str, Drawn]:
+        """Samples of each reference that needs no learning, by name; ``like`` is any composition of the model."""
         parts, horizon = self.parts(), self.model.horizon
         return {
-            name: self.score([replace(like, made=Reference.of(name, part, self.setting, horizon)) for part in parts], seed)
+            name: self.drawn([replace(like, made=Reference.of(name, part, self.setting, horizon)) for part in parts], seed)
             for name in NAMES
         }

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from ftl_lightning import networks
 from ftl_lightning.data.features import Observed, take
 from ftl_lightning.data.pinned import Pinned
-from ftl_lightning.igm.composition import Composition, Maker
+from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.diffusion import MOST_STEPS, PREDICTIONS, Context, Prediction, cosine_alpha_bar
 from ftl_lightning.igm.forms.adapter import LowRank, adaptable
 from ftl_lightning.igm.model import DiffusionModel, Draws
@@ -54,7 +54,7 @@ def build_denoiser(config: DiffusionConfig) -> nn.Module:
     reason = f"0 for a network that predicts {config.prediction}, which is not smooth"
     require(not (rough and smooth), "denoiser_args.smooth", reason, smooth)
     kind: type[nn.Module] = getattr(networks, config.denoiser)
-    over_time = config.prediction == "cosines" and getattr(kind, "over_time", False)
+    over_time = config.prediction in ("cosines", "remainder") and getattr(kind, "over_time", False)
     require(not over_time, "prediction", f"clean for {config.denoiser}, whose output is smooth by itself", "cosines")
     points = config.denoiser_args.get("initial_encoder") == "points" and config.image_dim
     reads = config.image_encoder.get("head") == "points"
@@ -64,9 +64,15 @@ def build_denoiser(config: DiffusionConfig) -> nn.Module:
         return denoiser
     columns = len(config.state_columns)
     require(columns in (0, config.state_dim), "observed, state", f"{config.state_dim} columns", columns)
-    if config.prediction == "cosines":
+    if config.prediction in ("cosines", "remainder"):
         check_cosines(config.horizon, "model.prediction cosines")
-    spectrum = Spectrum(config.horizon, config.state_dim) if config.prediction == "cosines" else None
+    spectrum = Spectrum(config.horizon, config.state_dim) if config.prediction in ("cosines", "remainder") else None
+    if config.prediction == "remainder":
+        import os
+
+        if os.environ.get("ZI", "1") == "1":
+            torch.nn.init.zeros_(denoiser.head.weight)
+            torch.nn.init.zeros_(denoiser.head.bias)
     return Prediction(denoiser, config.prediction, config.diffusion_steps, config.state_columns, spectrum)
 
 
@@ -107,12 +113,13 @@ class GenerativeModel(DiffusionModel, TextConceptModel):
 
     def losses(self, states: Tensor, observed: Observed, composition: Composition, draws: Draws | None, loss: str) -> Tensor:
         assert draws is not None
-        context = self.observe(observed)
-        return self.composed_losses(self.encode(states, observed), context, composition, draws, loss)
+        context, runs = self.observe(observed), range(len(composition.weights))
+        frames = None if self.frames is None else self.frames_by_plan([composition.row(run) for run in runs], len(draws.t))
+        return self.composed_losses(self.encode(states, observed, frames), context, composition, draws, loss)
 
-    def products(self, states: Tensor, observed: Observed, draws: Draws | None, loss: str) -> Tensor:
+    def products(self, states: Tensor, observed: Observed, frames: Tensor | None, draws: Draws | None, loss: str) -> Tensor:
         assert draws is not None
-        clean = self.encode(states, observed)
+        clean = self.encode(states, observed, frames)
         return self.branch_products(clean, self.observe(observed), self.training_embeddings, draws, loss)
 
     @torch.no_grad()
@@ -125,32 +132,36 @@ class GenerativeModel(DiffusionModel, TextConceptModel):
         observed: Observed | None = None,
     ) -> Tensor:
         features, shape = observed or {}, (len(compositions), count)
-        known, pinned = self.known_states(features), None
+        known, pinned, frames = self.known_states(features), None, self.frames_by_plan(compositions, count)
         if known is not None:
-            values = self.encode(known, features)  # NaN where a number depends on an unknown state
+            values = self.encode(known, features, frames)  # NaN where a number depends on an unknown state
             pinned = Pinned(~values.isnan(), values.nan_to_num())
-        makers = [composition.uncomposed.made for composition in compositions]
-        if all(makers):
-            states = self._made(makers, count, generators, features)
-            states = states if pinned is None else self.decode(pinned(self.encode(states, features)), features)
-        elif any(makers):
-            parts = zip(compositions, generators, torch.arange(len(compositions) * count).split(count), strict=True)
-            each = [self.sample([part], count, sampling, [draw], take(features, rows)) for part, draw, rows in parts]
-            return torch.cat(each)
-        else:
+        parts = [composition.uncomposed for composition in compositions]
+        if any(part.made is None or part.share < 1 for part in parts):
             plans = self.composed_plans(compositions, count, sampling, generators, self.observe(features), pinned)
-            states = self.decode(plans, features)
+            states = self.decode(plans, features, frames)
+        else:
+            states = torch.zeros(())
+        if any(part.made for part in parts):
+            made = self._made(parts, count, generators, features)
+            if pinned is not None:
+                made = self.decode(pinned(self.encode(made, features, frames)), features, frames)
+            states = torch.where(made.isnan(), states.to(made), made)
         if known is not None:
             states = torch.where(known.isnan(), states, known)
         return states.unflatten(0, shape)
 
-    def _made(
-        self, makers: Sequence[Maker | None], count: int, generators: Sequence[torch.Generator], features: Observed
-    ) -> Tensor:
-        """Samples ``(composition * count, horizon, state)`` of makers, as the columns' kinds allow."""
-        parts = []
-        for number, (maker, draw) in enumerate(zip(makers, generators, strict=True)):
-            assert maker is not None
-            parts.append(maker.sample(take(features, slice(number * count, (number + 1) * count)), count, draw))
-        states = torch.cat(parts).to(self.device)
-        return states if self.view is None else self.decode(self.encode(states, features), features)
+    def _made(self, parts: Sequence[Composition], count: int, generators: Sequence[torch.Generator], features: Observed) -> Tensor:
+        """Samples ``(composition * count, horizon, state)`` of makers, as kinds of columns allow; NaN for the network."""
+        made = torch.full((len(parts), count, self.horizon, len(self.domain.plans.columns)), torch.nan, device=self.device)
+        for number, (part, draw) in enumerate(zip(parts, generators, strict=True)):
+            if part.made is None:
+                continue
+            seen = take(features, slice(number * count, (number + 1) * count))
+            states = part.made.sample(seen, count, draw).to(made)
+            states = states if self.view is None else self.decode(self.encode(states, seen), seen)
+            if part.share < 1:  # stratified: the share is exact for many samples
+                place = (torch.rand(1, generator=draw) + torch.randperm(count, generator=draw)) / count
+                states = states.where((place < part.share).to(self.device)[:, None, None], torch.nan)
+            made[number] = states
+        return made.flatten(0, 1)

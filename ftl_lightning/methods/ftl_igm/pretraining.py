@@ -84,6 +84,7 @@ class PretrainingModule(Pretraining[GenerativeModel]):
     """
 
     flat = PRETRAINING
+    framed = True
 
     def __init__(
         self,
@@ -113,7 +114,8 @@ class PretrainingModule(Pretraining[GenerativeModel]):
         model = GenerativeModel(prepared.configured(DiffusionConfig, denoiser_args=self.denoiser_args, **network))
         if isinstance(model.denoiser, Prediction) and model.denoiser.spectrum is not None:
             windows = data.some_windows(WINDOWS)
-            model.denoiser.spectrum.fit(model.encode(windows.states, windows.observed))
+            frames = None if model.frames is None else model.frames[windows.concepts]
+            model.denoiser.spectrum.fit(model.encode(windows.states, windows.observed, frames))
         if self.codes.share and self.codes.knots > 1 and not model.over_time:
             reason = f"whose concepts do not vary over a plan, found {self.codes.knots}"
             raise UserError(f"model.codes.knots: expected 1 for {model.config.denoiser}, {reason}")
@@ -127,7 +129,7 @@ class PretrainingModule(Pretraining[GenerativeModel]):
     def losses(self, model: GenerativeModel, batch: Batch, draw: torch.Generator) -> Tensor:
         """Loss of Eq. 1, with condition dropout in training."""
         states, seen = batch.states, batch.observed
-        clean = model.encode(states, seen)
+        clean = model.encode(states, seen, None if model.frames is None else model.frames[batch.concepts])
         context, concept = model.observe(seen), batch.concepts
         if (draws := self.draws) > 1:
             clean, concept = clean.repeat(draws, 1, 1), concept.repeat(draws)
@@ -147,7 +149,16 @@ class PretrainingModule(Pretraining[GenerativeModel]):
         else:
             t = timesteps(drawn(count, lambda n: torch.rand(n, generator=draw, device=self.device)), total, power)
         noise = drawn(count, lambda n: torch.randn((n, *clean.shape[1:]), generator=draw, device=self.device))
+        import os
+        P = float(os.environ.get("PW", "0"))
+        metric = None
+        if P and self.hparams["prediction"] == "remainder":
+            spectrum = model.denoiser.spectrum
+            scale = spectrum.scale
+            w = (scale / scale.max()).clamp(min=1e-3) ** (-P / 2)
+            w = w / (w.square() * scale.square()).sum().sqrt() * scale.square().sum().sqrt()
+            metric = lambda e: torch.einsum("ct,bts->bcs", spectrum.basis, e) * w
         losses = denoising_loss(
-            lambda x, t: model.denoiser(x, t, concepts, index, context), clean, noise, t, model.alpha_bar, self.loss.discount
+            lambda x, t: model.denoiser(x, t, concepts, index, context), clean, noise, t, model.alpha_bar, self.loss.discount, metric
         )
         return losses * loss_weights(self.loss.kind, model.alpha_bar)[t]
