@@ -34,7 +34,7 @@ UNITS = 10.0  # ratio of values that suggests other units
 APART = {3: 25.0, 4: 12.0}  # ratio to the usual distance that makes an outlier, by the number of demonstrations
 APART_PLACES, APART_SHAPES = 12.0, 4.0  # ratios for five and more: of states, and of their shapes regardless of place and size
 CLOSEST = {3: 0.5}  # minimum usual distance, as a share of the others' spread, by the number of demonstrations; otherwise 0.1
-MANY, SELDOM = 20, 0.1  # demonstrations from which on columns that a smaller share of them uses make no outlier
+SELDOM, PARTLY = 0.1, 0.5  # maximum shares of times at which others, and a demonstration, use a column that makes it no outlier
 MOST_COMPARED = 50  # demonstrations, evenly taken, whose distances among them are usual for an outlier
 MOST_CHECKED, MOST_LINES = 1000, 2  # demonstrations that are checked before pretraining, and lines of findings
 MOST_WIDTH = 1000  # columns that are checked
@@ -468,15 +468,15 @@ def _outliers(demonstrations: Demonstrations) -> Iterator[Finding]:
     count, points = len(demonstrations), _points(_paths(demonstrations))
     if count < 3:
         return
-    if count >= MANY:  # the usual spread of a column that few demonstrations use says nothing about them
-        used = (points != points.flatten(0, 1).median(dim=0).values).any(dim=1).double().mean(dim=0) >= SELDOM
-        points = points[:, :, used | ~used.any()]
+    away = (points != points.flatten(0, 1).median(dim=0).values).double().mean(dim=1)  # share of times, (demo, state)
+    others = (away.sum(dim=0) - away) / (count - 1)
+    rare = (others < SELDOM) & (away < PARTLY)
     views = [(points / _spread(points), APART_PLACES, "is far from the others")]
     if points.shape[1] > 1:
         views.append((_shapes(points), APART_SHAPES, "moves otherwise than the others"))
     reported: set[int] = set()
     for view, limit, words in views:
-        ratios, beyond = _far(view)
+        ratios, beyond = _far(view, rare)
         for row, (ratio, apart) in enumerate(zip(ratios.tolist(), beyond.tolist(), strict=True)):
             if row not in reported and ratio > APART.get(count, limit) and (count < 5 or apart > BEYOND):
                 reported.add(row)
@@ -494,16 +494,16 @@ def _spreads_of_others(points: Tensor) -> Tensor:
     return torch.maximum((squares - means.square()).clamp(min=0).sqrt(), 0.1 * centred.square().mean(dim=(0, 1)).sqrt())
 
 
-def _far(points: Tensor) -> tuple[Tensor, Tensor]:
+def _far(points: Tensor, rare: Tensor) -> tuple[Tensor, Tensor]:
     """Distances of each demonstration from the others relative to distances among them, of points ``(demo, point, state)``.
 
-    Columns are scaled by the spread of the others, so that an outlier does not inflate it.
+    Columns are scaled by the spread of the others, so that an outlier does not inflate it; ``rare (demo, state)`` do not count.
 
     Returns:
         Ratios of medians, and of the minimum to the maximum, each ``(demo,)``.
     """
     count, size, scales = len(points), points[0].numel(), _spreads_of_others(points)
-    weights = torch.where(scales > SAME, scales, 1).pow(-2)
+    weights = torch.where(scales > SAME, scales, 1).pow(-2) * ~rare
     others = torch.arange(count - 1).repeat(count, 1)
     others += others >= torch.arange(count)[:, None]  # (demo, other)
     some = others[:, :: -(-(count - 1) // MOST_COMPARED)]

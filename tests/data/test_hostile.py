@@ -127,6 +127,16 @@ def test_a_rarely_used_column_makes_no_outlier_of_a_good_demonstration() -> None
     assert odd.rows == (40,)
 
 
+@pytest.mark.parametrize("count", [5, 8, 10])
+def test_pictures_of_digits_have_no_outlier(count: int) -> None:
+    """Row by row of 8 columns; few of them use the columns at the edge."""
+    digits = pytest.importorskip("sklearn.datasets").load_digits()
+    for digit in range(10):
+        pictures = digits.images[digits.target == digit][: 2 * count].reshape(2, count, 8, 8)
+        for part in pictures:
+            assert not [finding for finding in check(Demonstrations.of(list(part), "a")) if finding.severity != "note"]
+
+
 def test_kinds_are_those_of_the_whole_file(capsys: Told) -> None:
     """One concept alone would show a quaternion, or two values; the file shows more."""
     draw = np.random.default_rng(0)
