@@ -142,9 +142,7 @@ def check(options: CheckOptions) -> None:
                 note(f"{options.file}: {text}")
     for text in (*alike(demonstrations.concepts), *map(str, axes(demonstrations))):
         note(f"{options.file}: {text}")
-    checks, rows_of = [], dict[str, list[int]]()
-    for row, text in enumerate(demonstrations.concepts):
-        rows_of.setdefault(text, []).append(row)
+    checks, rows_of = [], demonstrations.rows_of
     if len(rows_of) > MOST_CONCEPTS:
         note(f"{options.file}: the first {MOST_CONCEPTS} of {len(rows_of)} concepts are checked")
     for rows in list(rows_of.values())[:MOST_CONCEPTS]:

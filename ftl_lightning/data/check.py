@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ftl_lightning.data.demonstrations import Demonstrations, paths_of, read_contents
+from ftl_lightning.data.demonstrations import Demonstrations, in_sequence, paths_of, read_contents
 from ftl_lightning.data.features import BLOCK
 from ftl_lightning.data.kinds import LINEAR, Columns, resolved
 from ftl_lightning.services.errors import UserError, about, short
@@ -34,7 +34,7 @@ UNITS = 10.0  # ratio of values that suggests other units
 APART = {3: 25.0, 4: 12.0}  # ratio to the usual distance that makes an outlier, by the number of demonstrations
 APART_PLACES, APART_SHAPES = 12.0, 4.0  # ratios for five and more: of states, and of their shapes regardless of place and size
 CLOSEST = {3: 0.5}  # minimum usual distance, as a share of the others' spread, by the number of demonstrations; otherwise 0.1
-MANY, SELDOM = 20, 0.1  # demonstrations from which on columns that a smaller share of them uses make no outlier
+SELDOM, PARTLY = 0.1, 0.5  # maximum shares of times at which others, and a demonstration, use a column that makes it no outlier
 MOST_COMPARED = 50  # demonstrations, evenly taken, whose distances among them are usual for an outlier
 MOST_CHECKED, MOST_LINES = 1000, 2  # demonstrations that are checked before pretraining, and lines of findings
 MOST_WIDTH = 1000  # columns that are checked
@@ -161,11 +161,10 @@ def check_each(demonstrations: Demonstrations) -> list[str]:
         demonstrations: of any number of concepts.
     """
     found = [str(finding) for finding in axes(demonstrations)]
-    names = tuple(dict.fromkeys(demonstrations.concepts))
-    each = max(MOST_CHECKED // len(names), 3)
-    for name in names[:MOST_CHECKED] if not found else ():
-        part = demonstrations.select(name)
-        some = part.rows(list(range(min(len(part), each))))
+    rows_of = demonstrations.rows_of
+    each = max(MOST_CHECKED // len(rows_of), 3)
+    for name, rows in list(rows_of.items())[:MOST_CHECKED] if not found else ():
+        some = demonstrations.rows(rows[:each])
         found += [f"{short(name, 40)}: {finding}" for finding in check(some) if finding.severity != "note"]
     more = len(found) - MOST_LINES
     return found if more <= 0 else [*found[: MOST_LINES - 1], f"{more + 1} more; list them: python -m ftl_lightning check"]
@@ -180,7 +179,7 @@ def with_kinds(demonstrations: Demonstrations) -> tuple[Demonstrations, list[str
         known = False  # kinds of a file are not resolved
     if known:
         return demonstrations, []
-    kinds = resolved(paths_of(demonstrations), names, demonstrations.state_units, kinds or ("",) * len(names), "states")
+    kinds = resolved(in_sequence(demonstrations), names, demonstrations.state_units, kinds or ("",) * len(names), "states")
     return replace(demonstrations, state_kinds=kinds or (LINEAR,) * len(names)), list(Columns(kinds).notes(names))
 
 
@@ -469,18 +468,17 @@ def _outliers(demonstrations: Demonstrations) -> Iterator[Finding]:
     count, points = len(demonstrations), _points(_paths(demonstrations))
     if count < 3:
         return
-    if count >= MANY:  # the usual spread of a column that few demonstrations use says nothing about them
-        used = (points != points.flatten(0, 1).median(dim=0).values).any(dim=1).double().mean(dim=0) >= SELDOM
-        points = points[:, :, used | ~used.any()]
+    away = (points != points.flatten(0, 1).median(dim=0).values).double().mean(dim=1)  # share of times, (demo, state)
+    others = (away.sum(dim=0) - away) / (count - 1)
+    rare = (others < SELDOM) & (away < PARTLY)
     views = [(points / _spread(points), APART_PLACES, "is far from the others")]
     if points.shape[1] > 1:
         views.append((_shapes(points), APART_SHAPES, "moves otherwise than the others"))
     reported: set[int] = set()
     for view, limit, words in views:
-        spreads = _spreads_of_others(view)
-        for row in range(count):
-            ratio, beyond = _far(view, spreads, row)
-            if row not in reported and ratio > APART.get(count, limit) and (count < 5 or beyond > BEYOND):
+        ratios, beyond = _far(view, rare)
+        for row, (ratio, apart) in enumerate(zip(ratios.tolist(), beyond.tolist(), strict=True)):
+            if row not in reported and ratio > APART.get(count, limit) and (count < 5 or apart > BEYOND):
                 reported.add(row)
                 yield Finding(f"{words}: {ratio:.0f} times the usual distance among them; another concept?", rows=(row,))
 
@@ -496,15 +494,26 @@ def _spreads_of_others(points: Tensor) -> Tensor:
     return torch.maximum((squares - means.square()).clamp(min=0).sqrt(), 0.1 * centred.square().mean(dim=(0, 1)).sqrt())
 
 
-def _far(points: Tensor, spreads: Tensor, row: int) -> tuple[float, float]:
-    """Distance of a demonstration from the others relative to distances among them: ratio of medians, and minimum over maximum.
+def _far(points: Tensor, rare: Tensor) -> tuple[Tensor, Tensor]:
+    """Distances of each demonstration from the others relative to distances among them, of points ``(demo, point, state)``.
 
-    Columns are scaled by the spread of the others, so that an outlier does not inflate it.
+    Columns are scaled by the spread of the others, so that an outlier does not inflate it; ``rare (demo, state)`` do not count.
+
+    Returns:
+        Ratios of medians, and of the minimum to the maximum, each ``(demo,)``.
     """
-    others, scale = _others(range(len(points)), row), spreads[row]
-    scaled = (points / torch.where(scale > SAME, scale, 1)).flatten(1)
-    gaps = (scaled[others] - scaled[row]).square().mean(dim=1).sqrt()
-    some = others[:: -(-len(others) // MOST_COMPARED)]
-    among = _pairs(_apart(scaled[some]))
-    closest = CLOSEST.get(len(points), 0.1)
-    return float(gaps.median() / among.median().clamp(min=closest)), float(gaps.min() / among.max().clamp(min=closest))
+    count, size, scales = len(points), points[0].numel(), _spreads_of_others(points)
+    weights = torch.where(scales > SAME, scales, 1).pow(-2) * ~rare
+    others = torch.arange(count - 1).repeat(count, 1)
+    others += others >= torch.arange(count)[:, None]  # (demo, other)
+    some = others[:, :: -(-(count - 1) // MOST_COMPARED)]
+    left, right = (some[:, index] for index in torch.triu_indices(some.shape[1], some.shape[1], offset=1))
+    gaps, among = torch.zeros(others.shape, dtype=torch.double), torch.zeros(left.shape, dtype=torch.double)
+    for column, weight in enumerate(weights.T[..., None]):
+        values = points[..., column].contiguous()
+        squares = torch.cdist(values, values, compute_mode="donot_use_mm_for_euclid_dist").square()
+        gaps += weight * squares.gather(1, others)
+        among += weight * squares[left, right]
+    gaps, among, closest = (gaps / size).sqrt(), (among / size).sqrt(), CLOSEST.get(count, 0.1)
+    usual, largest = among.median(dim=1).values.clamp(min=closest), among.amax(dim=1).clamp(min=closest)
+    return gaps.median(dim=1).values / usual, gaps.amin(dim=1) / largest

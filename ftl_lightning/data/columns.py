@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from ftl_lightning.data.demonstrations import Demonstrations, paths_of
+from ftl_lightning.data.demonstrations import Demonstrations, in_sequence
 from ftl_lightning.data.features import moves
 from ftl_lightning.data.kinds import TURNS
 from ftl_lightning.services.errors import UserError, note, require, short
@@ -33,14 +33,14 @@ def check_precision(demonstrations: Demonstrations) -> None:
     Raises:
         UserError: naming the column.
     """
-    paths = [path.double() for path in paths_of(demonstrations)]
-    every = torch.cat(paths)
+    paths = in_sequence(demonstrations)
+    every, within = paths.states.double(), paths.within
     low, high = every.amin(dim=0), every.amax(dim=0)
     valid = torch.arange(demonstrations.states.shape[1]) < demonstrations.lengths[:, None]
     smooth = moves(demonstrations.states.double().numpy(), valid[..., None].numpy())
     for column, name in enumerate(demonstrations.state_names):
         size, width = max(abs(float(low[column])), abs(float(high[column]))), float(high[column] - low[column])
-        steps = torch.cat([path[:, column].diff().abs() for path in paths])
+        steps = every[:, column].diff().abs()[within]
         moving, place = steps[steps > 0], f"key 'states': column {short(name, 40)!r}"
         if not len(moving) or not width:
             continue

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ftl_lightning.data.features import Feature, InitialStates, Observed, check_whole, precise, take
-from ftl_lightning.data.kinds import KINDS
+from ftl_lightning.data.kinds import KINDS, Paths
 from ftl_lightning.services.errors import UserError, about, require, short
 from ftl_lightning.services.files import MOST_RATIO, MOST_TENSORS, MOST_UNPACKED, raised, read_from, written_to
 from ftl_lightning.services.tensor_file import bytes_hash, serialise
@@ -56,6 +56,8 @@ class Format:
 
 MOST_COLUMNS = 10_000
 """Maximum number of columns of states in a file."""
+MOST_DEMONSTRATIONS, MOST_CONCEPTS = 200_000, 20_000
+"""Maximum numbers of demonstrations and of concepts in a file."""
 FOREIGN = (".pkl", ".pickle", ".joblib", ".xlsx", ".xls", ".feather", ".zarr", ".bag", ".mcap", ".tfrecord", ".txt", ".gz", ".zip")
 """Suffixes of files that are not read."""
 FORMATS: dict[str, Format] = {}
@@ -71,6 +73,10 @@ def read_contents(path: str | Path) -> Contents:
     states, lengths = contents["states"], contents["lengths"]
     columns = states.shape[2] if states.dim() == 3 else 0
     require(columns <= MOST_COLUMNS, f"{name}: key 'states'", f"at most {MOST_COLUMNS} columns", columns)
+    count = len(states) if states.dim() else 0
+    require(count <= MOST_DEMONSTRATIONS, f"{name}: key 'states'", f"at most {MOST_DEMONSTRATIONS} demonstrations", count)
+    count = len(set(contents["concepts"]))
+    require(count <= MOST_CONCEPTS, f"{name}: key 'concepts'", f"at most {MOST_CONCEPTS} different texts", count)
     whole = lengths.dtype == torch.int64 and lengths.shape == states.shape[:1]
     if states.dim() == 3 and whole and bool(((lengths >= 1) & (lengths <= states.shape[1])).all()):
         contents["states"] = held(states, lengths)
@@ -210,6 +216,14 @@ class Demonstrations(Shown):
         """Shape and kind of each observed feature."""
         return {name: Feature.of(values, leading=2 if name in self.per_step else 1) for name, values in self.observed.items()}
 
+    @property
+    def rows_of(self) -> dict[str, list[int]]:
+        """Numbers of the demonstrations of each concept, in order of first appearance."""
+        rows: dict[str, list[int]] = {}
+        for row, text in enumerate(self.concepts):
+            rows.setdefault(text, []).append(row)
+        return rows
+
     def select(self, concept: str) -> Self:
         """Select the demonstrations of a concept."""
         return self.rows([index for index, text in enumerate(self.concepts) if text == concept])
@@ -338,6 +352,12 @@ class Demonstrations(Shown):
 def paths_of(demonstrations: Demonstrations) -> list[Tensor]:
     """States ``(time, state)`` of each of the ``demonstrations``, without padding."""
     return [states[:length] for states, length in zip(demonstrations.states, demonstrations.lengths.tolist(), strict=True)]
+
+
+def in_sequence(demonstrations: Demonstrations) -> Paths:
+    """States of all ``demonstrations`` as in :func:`paths_of`, in a single tensor."""
+    valid = torch.arange(demonstrations.states.shape[1]) < demonstrations.lengths[:, None]
+    return Paths(demonstrations.states[valid], demonstrations.lengths)
 
 
 def held(values: Tensor, lengths: Tensor, continues: float = CONTINUES) -> Tensor:

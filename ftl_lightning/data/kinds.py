@@ -22,6 +22,7 @@ paths wrap), ``'quaternion 0 1'`` (component and its sign at the first time), ``
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -60,6 +61,30 @@ PAIRS = ((0.0, 1.0), (-1.0, 1.0))
 MOST_INVALID, MOST_UNNAMED = 0.5, 0.25
 """Maximum share of invalid rotations in columns that are rotations by all others and by their names, or quaternions without names.
 """
+
+
+class Paths(NamedTuple):
+    """Demonstrations in sequence, without padding.
+
+    Attributes:
+        states: ``(time, state)`` of all.
+        lengths: ``(demo,)`` int64.
+    """
+
+    states: Tensor
+    lengths: Tensor
+
+    @property
+    def firsts(self) -> Tensor:
+        """Index of the first state of each demonstration ``(demo,)``."""
+        return self.lengths.cumsum(dim=0) - self.lengths
+
+    @property
+    def within(self) -> Tensor:
+        """Whether steps ``(time - 1,)`` stay within a demonstration."""
+        inside = torch.ones(max(len(self.states) - 1, 0), dtype=torch.bool)
+        inside[self.firsts[1:] - 1] = False
+        return inside
 
 
 @dataclass(frozen=True)
@@ -212,13 +237,11 @@ def declared(names: Sequence[str], of_file: Sequence[str], given: Mapping[str, s
     return tuple(kinds)
 
 
-def resolved(
-    paths: Sequence[Tensor], names: Sequence[str], units: Sequence[str], kinds: Sequence[str], place: str
-) -> tuple[str, ...]:
+def resolved(paths: Paths, names: Sequence[str], units: Sequence[str], kinds: Sequence[str], place: str) -> tuple[str, ...]:
     """Complete declared kinds by what the data show, and propose kinds for the others of at most :data:`MOST_PROPOSED` columns.
 
     Args:
-        paths: states ``(time, state)`` of each demonstration, without padding.
+        paths: states of all demonstrations.
         names, units: of each column.
         kinds: declared kinds, empty where none is.
         place: file or option in messages.
@@ -230,7 +253,7 @@ def resolved(
         UserError: naming the column, demonstration and time of a value that contradicts a declared kind, or the kind of nearly all
             other values.
     """
-    every = torch.cat(list(paths)).double()
+    every = paths.states.double()
     groups: list[Group] = []
     column, few = 0, len(names) <= MOST_PROPOSED
     while column < len(names):
@@ -276,27 +299,28 @@ def _resolved(kinds: Sequence[str], first: int) -> Group | None:
     return Group(kind, first, count, numbers)
 
 
-def check_values(paths: Sequence[Tensor], names: Sequence[str], kinds: Sequence[str]) -> None:
+def check_values(paths: Paths, names: Sequence[str], kinds: Sequence[str]) -> None:
     """Refuse values that contradict the resolved kinds of a model; ``UserError`` with the column, demonstration and time."""
     for group in Columns(kinds).groups:
         if group.kind in _VALID:
             _require_valid(group, paths, f"column {short(names[group.first], 40)!r}", ", as the model's")
 
 
-def _require_valid(group: Group, paths: Sequence[Tensor], place: str, more: str = "", advice: str = "") -> None:
+def _require_valid(group: Group, paths: Paths, place: str, more: str = "", advice: str = "") -> None:
     """Refuse a value that is none of the group's kind; ``UserError`` with the first demonstration and time."""
-    for number, path in enumerate(paths, 1):
-        values = path[:, group.columns].double()
-        invalid = ~_VALID[group.kind](values, group.numbers)
-        if bool(invalid.any()):
-            time = int(invalid.int().argmax())
-            row = f"({short(', '.join(f'{value:.4g}' for value in values[time].tolist()), 60)})"
-            expected = _EXPECTED[group.kind].format(*(f"{value:g}" for value in group.numbers)) + more
-            raise UserError(f"{place}: expected {expected}, found {row} in demonstration {number} at time {time}{advice}")
+    values = paths.states[:, group.columns].double()
+    invalid = ~_VALID[group.kind](values, group.numbers)
+    if bool(invalid.any()):
+        index = int(invalid.int().argmax())
+        number = int((paths.firsts <= index).sum())  # from 1
+        time = index - int(paths.firsts[number - 1])
+        row = f"({short(', '.join(f'{value:.4g}' for value in values[index].tolist()), 60)})"
+        expected = _EXPECTED[group.kind].format(*(f"{value:g}" for value in group.numbers)) + more
+        raise UserError(f"{place}: expected {expected}, found {row} in demonstration {number} at time {time}{advice}")
 
 
 def _declared_group(
-    paths: Sequence[Tensor], every: Tensor, names: Sequence[str], units: Sequence[str], kinds: Sequence[str], first: int, place: str
+    paths: Paths, every: Tensor, names: Sequence[str], units: Sequence[str], kinds: Sequence[str], first: int, place: str
 ) -> Group:
     kind = kinds[first].split()[0]
     words = [text.split()[0] if text.split() else "" for text in kinds]
@@ -341,7 +365,7 @@ def _declared_group(
 
 
 def _proposed(
-    paths: Sequence[Tensor], every: Tensor, names: Sequence[str], units: Sequence[str], kinds: Sequence[str], first: int, place: str
+    paths: Paths, every: Tensor, names: Sequence[str], units: Sequence[str], kinds: Sequence[str], first: int, place: str
 ) -> Group:
     """Group from ``first`` on that the data show, among columns without a declared kind; linear if they show none."""
     free = next((at for at in range(first, len(kinds)) if kinds[at].strip()), len(kinds)) - first
@@ -357,7 +381,7 @@ def _proposed(
     if free and tuple(rest[:, 0].unique()[:3].tolist()) in PAIRS:
         return Group(BINARY, first, 1, tuple(rest[:, 0].unique().tolist()))
     for turn in (turn_of(units[first]),) if units[first] else (RADIANS, DEGREES):
-        if turn and wraps([path[:, first] for path in paths], turn):
+        if turn and wraps(paths, first, turn):
             return Group(ANGLE, first, 1, _turn(paths, first, turn))
     return Group(LINEAR, first, 1)
 
@@ -385,46 +409,45 @@ def _homogeneous(values: Tensor, numbers: Sequence[float]) -> Tensor:
     return (whole.mT if numbers[1] else whole)[..., :3, :]
 
 
-def _shows(group: Group, paths: Sequence[Tensor], names: Sequence[str]) -> bool:
+def _shows(group: Group, paths: Paths, names: Sequence[str]) -> bool:
     """Whether columns are rotations, but for a share of invalid ones of at most :data:`MOST_INVALID`."""
-    values = [path[:, group.columns].double() for path in paths]
-    kept = [path[_VALID[group.kind](path, group.numbers)] for path in values]
-    every = torch.cat(kept)
+    values = paths.states[:, group.columns].double()
+    valid = _VALID[group.kind](values, group.numbers)
+    every = values[valid]
     most = MOST_UNNAMED if group.kind == QUATERNION and not _named(names[group.columns]) else MOST_INVALID
-    if len(every) < (1 - most) * sum(map(len, values)):
+    if len(every) < (1 - most) * len(values):
         return False
     if group.kind == QUATERNION:
-        return _is_quaternion([path for path in kept if len(path)], names[group.columns])
+        lengths = torch.zeros_like(paths.lengths)
+        lengths.index_add_(0, torch.arange(len(lengths)).repeat_interleave(paths.lengths), valid.long())
+        return _is_quaternion(Paths(every, lengths[lengths > 0]), names[group.columns])
     return _moves(_homogeneous(every, group.numbers)[..., :3].flatten(-2) if group.kind == POSE else every)
 
 
-def wraps(columns: Sequence[Tensor], turn: float) -> bool:
-    """Whether angles ``(time,)`` of demonstrations fill a turn, and jump from end to end in rare steps."""
-    values = torch.cat(list(columns))
+def wraps(paths: Paths, column: int, turn: float) -> bool:
+    """Whether angles in a column fill a turn, and jump from end to end in rare steps."""
+    values = paths.states[:, column]
     if not TURN[0] <= float(values.max() - values.min()) / turn <= TURN[1]:
         return False
-    within = torch.ones(len(values), dtype=torch.bool)
-    within[torch.tensor(list(map(len, columns))).cumsum(0) - 1] = False  # the last time of each
-    sizes = values.diff().abs()[within[:-1]]
+    sizes = values.diff().abs()[paths.within]
     moving, jumps = sizes[sizes > 0], int((sizes > WRAPPED * turn).sum())
     return 0 < jumps * RARE < len(moving) and float(sizes.max()) > 2 * RARE * float(moving.median())
 
 
-def _turn(paths: Sequence[Tensor], column: int, turn: float) -> tuple[float, float, float]:
+def _turn(paths: Paths, column: int, turn: float) -> tuple[float, float, float]:
     """Lowest value, whole turn (by the range of values unless given), and 1 if paths wrap."""
-    values = torch.cat([path[:, column] for path in paths]).double()
+    values = paths.states[:, column].double()
     turn = turn or (DEGREES if float(values.abs().max()) > 2 * RADIANS else RADIANS)
-    columns = [path[:, column].double() for path in paths]
-    wraps = any(bool((column.diff().abs() > turn / 2).any()) for column in columns)
+    wraps = bool((values.diff().abs() > turn / 2)[paths.within].any())
     for low in (-turn / 2, 0.0, float(values.min())):
         if low <= float(values.min()) and float(values.max()) <= low + turn:
             return low, turn, 1.0
-    return (float(values.min()) if wraps else min(float(column[0]) for column in columns)), turn, float(wraps)
+    return float(values.min() if wraps else values[paths.firsts].min()), turn, float(wraps)
 
 
-def _sign(paths: Sequence[Tensor], first: int) -> tuple[float, float]:
+def _sign(paths: Paths, first: int) -> tuple[float, float]:
     """Component with the largest mean size at the first time, and its more frequent sign."""
-    starts = torch.stack([path[0, first : first + 4] for path in paths]).double()
+    starts = paths.states[paths.firsts, first : first + 4].double()
     component = int(starts.abs().mean(dim=0).argmax())
     return float(component), 1.0 if float(starts[:, component].sign().sum()) >= 0 else -1.0
 
@@ -484,12 +507,12 @@ def _named(names: Sequence[str]) -> bool:
     return letters == ["w", "x", "y", "z"] and all("q" in name.lower() or "rot" in name.lower() for name in names)
 
 
-def _is_quaternion(paths: Sequence[Tensor], names: Sequence[str]) -> bool:
+def _is_quaternion(paths: Paths, names: Sequence[str]) -> bool:
     """Whether columns ``(time, 4)`` of norm 1 are quaternions: by names, changes of sign, or no part of constant norm."""
-    every = torch.cat(list(paths)).double()
+    every = paths.states
     if not _moves(every, 2):
         return False
-    if any(bool(((path[1:] * path[:-1]).sum(dim=-1) < -0.5).any()) for path in paths):
+    if bool(((every[1:] * every[:-1]).sum(dim=-1) < -0.5)[paths.within].any()):
         return True
     if _named(names):
         return True

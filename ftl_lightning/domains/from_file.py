@@ -32,7 +32,7 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.data.columns import check_precision
-from ftl_lightning.data.demonstrations import Demonstrations, held, paths_of
+from ftl_lightning.data.demonstrations import Demonstrations, held, in_sequence
 from ftl_lightning.data.distances import warped_distances
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.data.kinds import LINEAR, Columns, check_values, declared, resolved
@@ -95,7 +95,7 @@ class OwnDomain(Domain):
         words = [[text.partition(" ")[0] for text in texts] for texts in (fitted.state_kinds or kinds, kinds)]
         wanted = f"{short(', '.join(words[1]), 100)}, the model's"
         require(words[0] == words[1], "key 'state_kinds'", wanted, short(", ".join(words[0]), 100))
-        check_values(paths_of(fitted), fitted.state_names, kinds)
+        check_values(in_sequence(fitted), fitted.state_names, kinds)
         check_precision(fitted)
         return replace(fitted, state_kinds=kinds, domain=demonstrations.domain)
 
@@ -188,18 +188,17 @@ def domain_from_file(
     demonstrations = of_kinds(read_own(path), kinds or {}, path)
     with about(path):
         check_precision(demonstrations)
-    training = tuple(dict.fromkeys(demonstrations.concepts))
+    rows_of = demonstrations.rows_of
     expected = "texts of two concepts or more to pretrain on"
-    require(len(training) >= 2, f"{path}: key 'concepts'", expected, len(training))
+    require(len(rows_of) >= 2, f"{path}: key 'concepts'", expected, len(rows_of))
     held_out = torch.zeros(len(demonstrations), dtype=torch.bool)
-    for text in training:
-        rows = _rows(demonstrations, text)
+    for text, rows in rows_of.items():
         require(len(rows) >= 2, f"{path}: concept {text!r}", "two demonstrations or more (one is held out)", len(rows))
         held_out[rows[-max(1, math.floor(share * len(rows))) :]] = True
     source = FileSource(demonstrations, held_out)
     longest = int(demonstrations.lengths.max())
     usual = longest if longest <= LONGEST_PLAN else WINDOW
-    return own_domain(source.split("validation", 0, 0), training, horizon or usual, metrics, source)
+    return own_domain(source.split("validation", 0, 0), tuple(rows_of), horizon or usual, metrics, source)
 
 
 def read_own(path: str) -> Demonstrations:
@@ -220,7 +219,7 @@ def of_kinds(demonstrations: Demonstrations, kinds: Mapping[str, str], place: st
     """
     names, units = demonstrations.state_names, demonstrations.state_units
     given = declared(names, demonstrations.state_kinds, kinds, f"{place}: data.kinds")
-    found = resolved(paths_of(demonstrations), names, units, given, place)
+    found = resolved(in_sequence(demonstrations), names, units, given, place)
     if not any(given):
         for text in Columns(found).notes(names):
             note(f"{place}: {text}; data.kinds declares others")

@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 
 LONGEST = 300
@@ -26,9 +27,14 @@ class Note(UserWarning):
     """Assumption about the input, or a change to it. The command line prints it as ``note: ...``."""
 
 
+_file: ContextVar[str] = ContextVar("file", default="")
+"""File of the outermost block of :func:`about`; empty outside."""
+
+
 def note(message: str) -> None:
-    """Warn of an assumption about the input, or of a change to it."""
-    warnings.warn(message, Note, stacklevel=3)
+    """Warn of an assumption about the input, or of a change to it; in a block of :func:`about` the message names the file."""
+    prefix = f"{_file.get()}: " if _file.get() else ""
+    warnings.warn(prefix + message.removeprefix(prefix), Note, stacklevel=3)
 
 
 def short(text: str, most: int = 60) -> str:
@@ -58,12 +64,18 @@ def require(condition: object, place: str, expected: str, found: object) -> None
 
 @contextmanager
 def about(where: str | Path) -> Iterator[None]:
-    """Prefix a :class:`UserError` of the block with a file name; :data:`LONGEST` characters at most unless the name is long."""
+    """Prefix a :class:`UserError` of the block with a file name; :data:`LONGEST` characters at most unless the name is long.
+
+    Notes of the block name the file of the outermost block.
+    """
+    before = _file.set(_file.get() or str(where))
     try:
         yield
     except UserError as error:
         message = str(error).removeprefix(f"{where}: ")
         raise UserError(f"{where}: {short(message, max(LONGEST - len(str(where)) - 20, 150))}") from error.__cause__
+    finally:
+        _file.reset(before)
 
 
 def mistake_behind(error: BaseException | None) -> UserError | None:

@@ -138,10 +138,10 @@ def notes_of(model: ConceptModel, demonstrations: Demonstrations) -> Iterator[st
     yield from map(str, axes(demonstrations))
     if longer := longer_than_plans(demonstrations, model):
         yield longer
-    names = dict.fromkeys(demonstrations.concepts)
-    for name in names:
-        for note in warnings_of(model, demonstrations.select(name)):
-            yield note if len(names) == 1 else f"{name}: {note}"
+    rows_of = demonstrations.rows_of
+    for name, rows in rows_of.items():
+        for note in warnings_of(model, demonstrations.rows(rows)):
+            yield note if len(rows_of) == 1 else f"{name}: {note}"
 
 
 def check_with(

@@ -151,8 +151,8 @@ def test_names_and_units_are_those_of_the_model_in_every_command(capfd: pytest.C
     for name in ("five", "swapped"):
         succeed("invert", models, f"{name}.npz", "--steps=2", "--form=paper", f"--out={name}")
     said = capfd.readouterr().err
-    assert "note: columns y, x are put in the model's order x, y" in said
-    assert "note: columns are converted to the model's units: y from ft to m" in said
+    assert "note: swapped.npz: columns y, x are put in the model's order x, y" in said
+    assert "note: swapped.npz: columns are converted to the model's units: y from ft to m" in said
     learned = [FewShot.from_pretrained(models).load(f"{name}/heart.safetensors").embeddings for name in ("five", "swapped")]
     torch.testing.assert_close(*learned, rtol=1e-3, atol=1e-4)
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from ftl_lightning.data.check import check
+from ftl_lightning.data.check import check, with_kinds
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.validation import parse_json
@@ -94,6 +94,18 @@ def test_of_many_demonstrations_and_concepts_the_first_are_checked(capsys: Told)
     assert told.out.count("walk ") == 200
 
 
+def test_a_hundred_thousand_demonstrations_are_read_at_once_and_as_many_concepts_refused(capsys: Told) -> None:
+    states = np.random.default_rng(0).normal(size=(100_000, 4, 1)).cumsum(axis=1).astype(np.float32)
+    np.savez("many.npz", states=states, concepts="walk")
+    np.savez("names.npz", states=states, concepts=[f"walk {number}" for number in range(len(states))])
+    np.savez("more.npz", states=np.zeros((200_001, 1, 1), np.float32))
+    begin = time.process_time()
+    assert with_kinds(Demonstrations.load("many.npz"))[1] == []
+    refused(capsys, ["check", "names.npz"], "names.npz: key 'concepts': expected at most 20000 different texts, found 100000")
+    refused(capsys, ["check", "more.npz"], "more.npz: key 'states': expected at most 200000 demonstrations, found 200001")
+    assert time.process_time() - begin < 4
+
+
 def test_images_are_compared_in_bounded_memory_and_time() -> None:
     paths = torch.randn(200, 6, 2, generator=torch.Generator().manual_seed(0)).cumsum(dim=1)
     paths[7] = paths[3]
@@ -113,6 +125,16 @@ def test_a_rarely_used_column_makes_no_outlier_of_a_good_demonstration() -> None
     states[40] += 30
     (odd,) = [finding for finding in check(Demonstrations.of(list(states), "four")) if finding.severity != "note"]
     assert odd.rows == (40,)
+
+
+@pytest.mark.parametrize("count", [5, 8, 10])
+def test_pictures_of_digits_have_no_outlier(count: int) -> None:
+    """Row by row of 8 columns; few of them use the columns at the edge."""
+    digits = pytest.importorskip("sklearn.datasets").load_digits()
+    for digit in range(10):
+        pictures = digits.images[digits.target == digit][: 2 * count].reshape(2, count, 8, 8)
+        for part in pictures:
+            assert not [finding for finding in check(Demonstrations.of(list(part), "a")) if finding.severity != "note"]
 
 
 def test_kinds_are_those_of_the_whole_file(capsys: Told) -> None:

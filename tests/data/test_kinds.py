@@ -9,7 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from ftl_lightning.data.kinds import Columns, check_values, declared, resolved
+from ftl_lightning.data.kinds import Columns, Paths, check_values, declared, resolved
 from ftl_lightning.services.errors import UserError
 from tests.conftest import CONF, refused, succeed
 from tests.tiny import QUIET
@@ -17,9 +17,13 @@ from tests.tiny import QUIET
 NO_UNITS = ("",) * 20
 
 
+def _paths(states: Tensor) -> Paths:
+    return Paths(states.flatten(0, 1), torch.full((len(states),), states.shape[1]))
+
+
 def kinds_of(states: Tensor, kinds: tuple[str, ...] = (), units: tuple[str, ...] = NO_UNITS) -> tuple[str, ...]:
     width = states.shape[2]
-    return resolved(list(states), tuple("abcdefghijklmnopqrst"[:width]), units[:width], kinds or ("",) * width, "file")
+    return resolved(_paths(states), tuple("abcdefghijklmnopqrst"[:width]), units[:width], kinds or ("",) * width, "file")
 
 
 def rotations(seed: int = 0, demos: int = 5, time: int = 30) -> Rotation:
@@ -212,11 +216,11 @@ def test_an_invalid_value_of_another_kind_is_named(states: Tensor, kind: str, ex
 def test_an_invalid_value_given_to_a_model_is_named() -> None:
     states = quaternions(True)
     kinds = kinds_of(states)
-    check_values(list(states), ("w", "x", "y", "z"), kinds)
+    check_values(_paths(states), ("w", "x", "y", "z"), kinds)
     states[1, 4] = 0
     expected = r"column 'w': expected quaternions of norm 1, as the model's, found \(0, 0, 0, 0\) in demonstration 2 at time 4"
     with pytest.raises(UserError, match=expected):
-        check_values(list(states), ("w", "x", "y", "z"), kinds)
+        check_values(_paths(states), ("w", "x", "y", "z"), kinds)
 
 
 def poses(rows: int, transposed: bool) -> Tensor:

@@ -2,6 +2,8 @@
 
 import math
 import re
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -108,10 +110,38 @@ def test_frames_are_bounded_before_they_are_made(tmp_path: Path, monkeypatch: py
     path = exported(tmp_path / "one.bvh", moving(60))
     path.write_text(path.read_text().replace("Frame Time: 0.033333", "Frame Time: 1"))
     assert int(imported(path).lengths.max()) == LONGEST  # one frame a second becomes thirty
-    monkeypatch.setattr("ftl_lightning.domains.mocap.prepare.MOST_FRAMES", 1000)
+    monkeypatch.setattr("ftl_lightning.domains.mocap.bvh.MOST_FRAMES", 1000)
     monkeypatch.setattr("ftl_lightning.domains.mocap.prepare._at_rate", None)
     with pytest.raises(UserError, match="expected motion of at most 1000 frames at 30 a second, found 1800: 60 of 1 s"):
         imported(path)
+
+
+def _many(count: int, seconds: str, last: str) -> Callable[[str], str]:
+    """Change of a file to many short frames, whose last number is ``last``."""
+
+    def changed(text: str) -> str:
+        head, _ = text.split("Frames:")
+        return f"{head}Frames: {count}\nFrame Time: {seconds}\n" + ("0 " * 50 + "0\n") * (count - 1) + "0 " * 50 + last
+
+    return changed
+
+
+@pytest.mark.parametrize(
+    ("seconds", "last", "expected"),
+    [
+        ("1", "0", "expected motion of at most 100000 frames at 30 a second, found 2700000: 90000 of 1 s"),
+        ("0.033", "nan", "found a damaged one ('nan' where a number was expected)"),
+        ("0.033", "", "found a damaged one"),
+    ],
+)
+def test_a_day_of_frames_is_refused_at_once(seconds: str, last: str, expected: str, tmp_path: Path) -> None:
+    path = exported(tmp_path / "one.bvh", moving(60))
+    path.write_text(_many(90_000, seconds, last)(path.read_text()))
+    begin = time.process_time()
+    with pytest.raises(UserError) as error:
+        imported(path)
+    assert expected in str(error.value)
+    assert time.process_time() - begin < 2
 
 
 @pytest.mark.parametrize(
@@ -132,13 +162,15 @@ def test_frames_are_bounded_before_they_are_made(tmp_path: Path, monkeypatch: py
             for seconds in ("0", "-0.033", "nan", "inf", "1e5", "1e300", "1e-300", "5e-324", "1e9999")
         ),
         (lambda text: text.replace("Frame Time: 0.033333", "Frame Time: " + "x" * 100_000), "found a damaged one"),
-        (lambda text: text.replace("Frames: 60", "Frames: 999999999"), "Frames: expected 1 to 147058 frames of 17 joints"),
+        (lambda text: text.replace("Frames: 60", "Frames: 999999999"), "Frames: expected 1 to 98039 frames of 17 joints"),
         (lambda text: text.replace("Frames: 60", "Frames: -60"), "Frames: expected 1 to"),
         (lambda text: text.replace("Frames: 60", "Frames: " + "9" * 9999), "found a damaged one"),
         (lambda text: text.replace("\n0.", "\n1e308 ", 1), "found a damaged one"),
         (lambda text: text.replace("OFFSET 0.000000", "OFFSET 1e200", 1), "beyond 1e"),
         (lambda text: text.replace("JOINT", "JOINT a { OFFSET 0 0 0 CHANNELS 0 } " * 2000 + "JOINT", 1), "more than 1000 joints"),
         (lambda text: text.replace("\n0.", "\nnan ", 1), "found a damaged one"),
+        (lambda text: text + "0", "found a damaged one"),
+        (lambda text: text.replace("Frames: 60", "Frames: 98039"), "for 98039 frames of 51 numbers"),
         (lambda text: "", "found a damaged one"),
     ],
 )

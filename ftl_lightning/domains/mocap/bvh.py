@@ -1,6 +1,5 @@
 """BVH files, read and written: a position of a joint per frame replaces its offset, as in Blender."""
 
-import itertools
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -25,6 +24,10 @@ MOST_NODES = 1000
 """Maximum number of joints and end sites; a hand with all its fingers has 20."""
 MOST_PLACES = 2_500_000
 """Maximum number of positions, frames times nodes: 240 MB of rotations."""
+MOST_NUMBERS = 5_000_000
+"""Maximum number of numbers, frames times channels, which are parsed in a second; an hour at 30 frames a second, or more."""
+MOST_FRAMES = 100_000
+"""Maximum frames of a motion at :data:`~ftl_lightning.domains.mocap.skeleton.FPS`, almost an hour."""
 END = "EndSite"  # Prefix of the name of an end site, before its joint's name
 _POSITIONS = {f"{axis}position": number for number, axis in enumerate("XYZ")}
 _ROTATIONS = {f"{axis}rotation": number for number, axis in enumerate("XYZ")}
@@ -101,22 +104,23 @@ def read_motion(path: Path) -> Motion:
         count, seconds = int(words[1]), float(words[4])
         place, expected = f"{path}: Frame Time", f"seconds between frames, {FASTEST:g} to {SLOWEST:g}"
         require(FASTEST <= seconds <= SLOWEST, place, expected, short(words[4]))
-        place, expected = f"{path}: Frames", f"1 to {MOST_PLACES // len(nodes)} frames of {len(nodes)} joints and end sites"
-        require(1 <= count <= MOST_PLACES // len(nodes), place, expected, short(words[1]))
         channels = sum(len(node.channels) for node in nodes)
-        values = _numbers(words[5] if len(words) > 5 else "", count * channels)
+        most = min(MOST_PLACES // len(nodes), MOST_NUMBERS // max(channels, 1))
+        place, expected = f"{path}: Frames", f"1 to {most} frames of {len(nodes)} joints and end sites"
+        require(1 <= count <= most, place, expected, short(words[1]))
+        expected = f"motion of at most {MOST_FRAMES} frames at {FPS} a second"
+        require(count * seconds * FPS <= MOST_FRAMES, str(path), expected, f"{count * seconds * FPS:.0f}: {count} of {seconds:g} s")
+        numbers = words[5].strip() if len(words) > 5 else ""
+        _check(2 * count * channels - 1 <= len(numbers), f"{len(numbers)} letters for {count} frames of {channels} numbers")
+        foreign = re.search(r"[^-+.0-9eE\s]\S*", numbers)
+        _check(not foreign, f"{foreign and foreign[0]!r} where a number was expected")
+        values = np.fromstring(numbers, sep=" ")  # a list of all words takes gigabytes
         _check(len(values) == count * channels, f"{len(values)} numbers for {count} frames of {channels}")
         within = (np.abs(part) <= LARGEST for part in (values, *(node.offset for node in nodes)))
         _check(all(part.all() for part in within), f"numbers that are not finite, or beyond {LARGEST:g}")
     except ValueError as error:
         raise UserError(f"{path}: expected a BVH file, found a damaged one ({short(str(error), 100)})") from error
     return Motion(nodes, values.reshape(count, channels), seconds)
-
-
-def _numbers(text: str, most: int) -> Numbers:
-    """Numbers of a text, at most one more than ``most``; a ``ValueError`` for other words. A list of all words takes gigabytes."""
-    words = (float(word[0]) for word in re.finditer(r"\S+", text))
-    return np.fromiter(itertools.islice(words, most + 1), dtype=np.float64)
 
 
 def _check(condition: object, damage: str) -> None:
