@@ -75,7 +75,7 @@ def main() -> None:
         shares = {key: round(float(np.mean([trial[key] for trial in trials])), 4) for key in trials[0]}
         verdicts = [enough(data, kind, draw) for kind in data.new[:2] for draw in range(2)]
         found[name] = {"odd": shares, "enough": verdicts}
-        share, truth = (float(np.mean([row[key] for row in verdicts])) for key in ("suffices", "truth"))  # type: ignore[misc]
+        share, truth = (float(np.mean([row[key] for row in verdicts])) for key in ("suffices", "truth"))
         lines.append(f"| {name} | {' | '.join(f'{value:.2f}' for value in (*shares.values(), share, truth))} |")
         print(lines[-1], flush=True)
     options.out.write_text(json.dumps(found, indent=1) + "\n", "utf-8")
