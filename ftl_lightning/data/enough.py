@@ -114,7 +114,7 @@ class Enough:
         if self.suffices:
             return f"enough: {without}{said}: these suffice"
         asked = "many more" if self.more is None else f"about {self.more} more"
-        return f"enough: {without}{asked} are asked for: {said} ({HIGH} that hardly rises suffices)"
+        return f"enough: {without}{asked} {'is' if self.more == 1 else 'are'} asked for: {said} ({HIGH} that hardly rises suffices)"
 
 
 def _wanted(skills: Mapping[int, float], count: int) -> int | None:
