@@ -115,3 +115,14 @@ def test_check_says_whether_they_suffice_without_the_odd_one(capsys: pytest.Capt
     broken[0, 3, 0] = np.nan
     np.savez("broken.npz", states=broken, concepts="heart")
     assert "enough" not in checked("broken.npz")
+
+
+@pytest.mark.slow
+def test_a_model_of_own_data_names_the_odd_one_and_judges_the_others(capsys: pytest.CaptureFixture[str]) -> None:
+    states = drawn("heart", 5, 1).states.numpy().copy()
+    states[2] = strokes("S-curve", 1, 3)[0]
+    Demonstrations.of(list(states), "heart").save("odd.npz")
+    succeed("check", "odd.npz", "--pretrained", "strokes")
+    out = capsys.readouterr().out
+    assert "warning: demonstration 3: differs from the others more than is usual within a concept; another concept?" in out
+    assert "enough: without demonstration 3, " in out
