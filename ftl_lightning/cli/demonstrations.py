@@ -161,9 +161,14 @@ def check(options: CheckOptions) -> None:
 
 def _checked(model: "FewShot | None", demonstrations: "Demonstrations", faults: "tuple[Finding, ...]", learn: bool) -> "Check":
     from ftl_lightning.data.check import check as faults_of
-    from ftl_lightning.training.checks import Check, check_with
+    from ftl_lightning.data.enough import Enough
+    from ftl_lightning.training.checks import Check, check_with, faulty
 
     if model is None:
-        return Check(demonstrations.concepts[0], demonstrations, (*faults, *faults_of(demonstrations)))
+        findings = (*faults, *faults_of(demonstrations))
+        sound = not any(finding.severity == "error" for finding in findings)
+        longest = int(demonstrations.lengths.max())
+        enough = Enough.of(demonstrations, longest, without=faulty(findings)) if sound else None
+        return Check(demonstrations.concepts[0], demonstrations, findings, enough=enough)
     steps = model.tuned.learning_steps if learn else 0
     return check_with(model.model, demonstrations, model.tuned.inversion, steps, faults, progress=True)

@@ -81,6 +81,7 @@ def sample(options: SampleOptions) -> None:
     from ftl_lightning.evaluation.pictures import captioned, gif
     from ftl_lightning.few_shot.learner import FewShot
     from ftl_lightning.services.tensor_file import atomic, write_text
+    from ftl_lightning.training.quality import calibration_of
 
     model = FewShot.from_pretrained(options.pretrained, options.settings or None)
     text = " + ".join(part for part in (options.compose, options.concept) if part)
@@ -97,7 +98,8 @@ def sample(options: SampleOptions) -> None:
     # Without a configuration of the domain, the settings of invert must be given again.
     say(f"{options.out}: {len(plans)} samples; settings of {model.settings}")
     for name, value in (model.evaluate(plans, goal) if goal and model.domain.metrics else {}).items():
-        say(f"{name} on '{goal}': {value:.2f}")
+        calibration = calibration_of(model.judging, goal, name)
+        say(f"{name} on '{goal}': {value:.2f}{f' ({calibration})' if calibration else ''}")
     if options.figure:
         with atomic(options.figure) as temporary:
             model.render(plans, goal).savefig(temporary, dpi=110)

@@ -220,11 +220,14 @@ class Metric:
         less_is_better: whether a smaller value is better.
         identity: description of what the values depend on besides the code, such as the hash of a judge's weights; empty for a
             rule. It is part of the configuration's hash.
+        calibration: ``goal -> text``: how often the metric accepts real behaviour of the goal, or why it returns NaN; ``None`` for
+            a rule.
     """
 
     measure: Callable[[str, Tensor, InitialStates | None], Tensor]
     less_is_better: bool = False
     identity: str = ""
+    calibration: Callable[[str], str] | None = None
 
 
 @dataclass(frozen=True)

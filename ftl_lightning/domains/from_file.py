@@ -5,7 +5,8 @@ The training concepts are the texts in order of first appearance. Plans have the
 
 ``recognised: P``
     right if the goal is the likeliest of all concepts with demonstrations, and the plan is as typical of it as a share P of real
-    demonstrations: in place, size, shape and roughness, see :mod:`ftl_lightning.domains.recognition`.
+    demonstrations: in place, size, shape and roughness, see :mod:`ftl_lightning.domains.recognition`. Not measured (NaN) where a
+    training concept has fewer than :data:`CALIBRATED` held-out demonstrations.
 ``nearest_demonstration: K``
     right if most of the K demonstrations nearest to the plan (dynamic time warping, columns scaled alike) are of the goal.
 ``nearest_shape: K``
@@ -41,11 +42,14 @@ from ftl_lightning.domains.domain import OWN, Concepts, Domain, Metric, Plans, R
 from ftl_lightning.domains.recognition import Recognition
 from ftl_lightning.domains.recorder import drawn_by_hand
 from ftl_lightning.services.errors import about, note, require, short
-from ftl_lightning.services.randomness import generator
+from ftl_lightning.services.randomness import generator, task_key
 from ftl_lightning.services.spectrum import check_cosines
+from ftl_lightning.services.text import counted
 
 CONTINUOUS = "continuous"
 """View of data with columns that are not linear."""
+RECOGNISED, CALIBRATED = "recognised", 10
+"""Metric that is calibrated by held-out demonstrations, and the least number of them for each training concept."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +78,8 @@ class FileSource:
         return starts.take(torch.randint(len(starts), (count,), generator=generator("cpu", seed)))
 
 
+HELD_OUT = 3
+"""Seed of the demonstrations that are held out."""
 LONGEST_PLAN, WINDOW = 1024, 256
 """Maximum length of demonstrations that are learned whole by default, and the default length of windows of longer ones."""
 
@@ -132,8 +138,12 @@ def own_domain(
         columns=names,
     )
 
+    missing = uncalibrated(examples, training) if RECOGNISED in metrics else ""
+
     def metric(name: str, number: float) -> Metric:
         made = METRICS[name](judged, horizon, number)
+        if name == RECOGNISED and missing:
+            return Metric(_not_measured, identity=examples.hash, calibration=lambda goal: missing)
         return replace(
             made, measure=lambda goal, states, starts: made.measure(goal, convert(states), starts), identity=examples.hash
         )
@@ -160,6 +170,20 @@ def own_domain(
     )
 
 
+def uncalibrated(examples: Demonstrations, training: Sequence[str]) -> str:
+    """Why the metric recognised is not shown; empty if every training concept has enough held-out demonstrations."""
+    counts = {name: examples.concepts.count(name) for name in training}
+    fewest = min(counts, key=lambda name: counts[name])
+    if counts[fewest] >= CALIBRATED:
+        return ""
+    held = f"{short(fewest, 40)!r} has {counted(counts[fewest], 'held-out demonstration')}"
+    return f"{RECOGNISED} is not shown: {held}, {CALIBRATED} of each training concept calibrate it"
+
+
+def _not_measured(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
+    return torch.full((len(states),), torch.nan)
+
+
 def _same(states: Tensor) -> Tensor:
     return states
 
@@ -179,7 +203,7 @@ def domain_from_file(
         horizon: states in a plan; ``None`` for the length of the longest demonstration, or :data:`WINDOW` if it is longer than
             :data:`LONGEST_PLAN`.
         metrics: see :func:`own_domain`.
-        share: share of each concept's demonstrations to hold out, at least a single demonstration.
+        share: share of each concept's demonstrations to hold out at random, at least a single demonstration.
         kinds: kinds of columns by name, see :func:`~ftl_lightning.data.kinds.declared`.
 
     Raises:
@@ -194,7 +218,8 @@ def domain_from_file(
     held_out = torch.zeros(len(demonstrations), dtype=torch.bool)
     for text, rows in rows_of.items():
         require(len(rows) >= 2, f"{path}: concept {text!r}", "two demonstrations or more (one is held out)", len(rows))
-        held_out[rows[-max(1, math.floor(share * len(rows))) :]] = True
+        mixed = torch.randperm(len(rows), generator=generator("cpu", task_key(text), HELD_OUT))
+        held_out[torch.tensor(rows)[mixed[: max(1, math.floor(share * len(rows)))]]] = True
     source = FileSource(demonstrations, held_out)
     longest = int(demonstrations.lengths.max())
     usual = longest if longest <= LONGEST_PLAN else WINDOW
@@ -269,12 +294,17 @@ def _recognised(examples: Demonstrations, horizon: int, number: float) -> Metric
     require(0 < number <= 1, "data.metrics.recognised", "a share of real demonstrations above 0, at most 1", f"{number:g}")
     check_cosines(horizon, "the metric recognised")
     recognition = cache(lambda: Recognition(examples, horizon, number))  # fitted on first use
+    acceptance = cache(lambda count: recognition().acceptance(count))
+
+    def calibration(goal: str) -> str:
+        count = len(_goal_rows(examples, goal))
+        return f"accepts {acceptance(count):.2f} of held-out demonstrations by {count} others of their concept"
 
     def measure(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
         _goal_rows(examples, goal)
         return recognition().recognised(goal, states)
 
-    return Metric(measure, identity=examples.hash)
+    return Metric(measure, identity=examples.hash, calibration=calibration)
 
 
 def _nearest(name: str, examples: Demonstrations, number: float, distances: Callable[[Tensor], Tensor]) -> Metric:

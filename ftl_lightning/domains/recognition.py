@@ -37,6 +37,8 @@ RESTING = 0.25
 """Deviation from the last state after the end that counts as rest, in spreads of a column."""
 ENDS, LEFT_OUT = 8, 200
 """Maximum number of candidate lengths of a plan, and of examples for leave-one-out."""
+FOLDS = 5
+"""Parts of the examples of which one is judged with limits of the others."""
 FEW = 1.0
 """Relative increase of limits times the number of concepts in leave-one-out: limits from few concepts are uncertain."""
 ROUGHER = 2.0
@@ -179,24 +181,56 @@ class Recognition:
         typical = (deviation <= self._limits(len(self.rows[goal]))).all(dim=1)
         return finite & likeliest & typical
 
+    def acceptance(self, count: int) -> float:
+        """Share of left-out examples that are recognised by ``count`` others of their concept, with the limits of other examples.
+
+        NaN if no concept has two examples.
+        """
+        used, scores, deviations = self._leave_one_out(count)
+        if len(used) < 2:
+            return math.nan
+        rows = [row for _, row in used]
+        ending = [end.rows(rows) for end in self.presented]
+        likeliest = torch.ones(len(used), dtype=torch.bool)
+        for name, concept in self.concepts.items():
+            other = torch.tensor([own != name for own, _ in used])
+            likeliest &= ~other | (scores <= _nearest_end(concept, ending, self.resting)[0])
+        fold, typical = torch.arange(len(used)) % min(FOLDS, len(used)), torch.zeros_like(likeliest)
+        for number in fold.unique():
+            here = fold == number
+            typical[here] = (deviations[here] <= self._limits_of(deviations[~here])).all(dim=1)
+        return float((typical & likeliest).float().mean())
+
     def _left_out(self, count: int) -> Tensor:
         """Limits ``(5,)`` of deviations from a concept with ``count`` examples, by leave-one-out."""
+        used, _, deviations = self._leave_one_out(count)
+        if not used:
+            return torch.tensor([math.inf, math.inf, math.inf, ROUGHER, 1], dtype=torch.float64)
+        return self._limits_of(deviations)
+
+    def _limits_of(self, deviations: Tensor) -> Tensor:
+        """Limits ``(5,)`` of deviations ``(n, 5)`` that accept a share of them."""
+        limits = deviations.quantile(self.share, dim=0).clamp(min=1)
+        together = (deviations / limits).amax(dim=1).quantile(self.share)  # joint limit of all five
+        several = sum(len(rows) > 1 for rows in self.rows.values())
+        return (limits * together * (1 + FEW / several)).clamp(min=1)
+
+    def _leave_one_out(self, count: int) -> tuple[list[tuple[str, int]], Tensor, Tensor]:
+        """Concept and row of left-out examples, and their scores ``(n,)`` and deviations ``(n, 5)`` from ``count`` others."""
         draw = generator("cpu", count)
         pairs = [(concept, row) for concept, rows in self.rows.items() if len(rows) > 1 for row in rows]
-        if not pairs:
-            return torch.tensor([math.inf, math.inf, math.inf, ROUGHER, 1], dtype=torch.float64)
-        deviations = []
-        for pair in torch.randperm(len(pairs), generator=draw)[:LEFT_OUT].tolist():
-            concept, row = pairs[pair]
+        used = [pairs[pair] for pair in torch.randperm(len(pairs), generator=draw)[:LEFT_OUT].tolist()]
+        found = []
+        for concept, row in used:
             rest = [candidate for candidate in self.rows[concept] if candidate != row]
             chosen = [rest[index] for index in torch.randperm(len(rest), generator=draw)[:count].tolist()]
             within = self.total.plus(self.within[concept], -1).plus(_Within.of(self.known.rows(rest)))
             fitted = _Concept.of(self.known.rows(chosen), within if within.freedom else self.total)
-            deviations.append(_nearest_end(fitted, [ending.rows([row]) for ending in self.presented], self.resting)[1])
-        all_deviations = torch.cat(deviations)
-        limits = all_deviations.quantile(self.share, dim=0).clamp(min=1)
-        together = (all_deviations / limits).amax(dim=1).quantile(self.share)  # joint limit of all five
-        return (limits * together * (1 + FEW / len({concept for concept, _ in pairs}))).clamp(min=1)
+            found.append(_nearest_end(fitted, [ending.rows([row]) for ending in self.presented], self.resting))
+        if not found:
+            return [], torch.zeros(0, dtype=torch.float64), torch.zeros(0, 5, dtype=torch.float64)
+        scores, deviations = zip(*found, strict=True)
+        return used, torch.cat(scores), torch.cat(deviations)
 
     def _fitted(self, states: Tensor) -> Tensor:
         """Cut or pad with the last state to ``(n, horizon, state)``."""

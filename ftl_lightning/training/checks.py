@@ -1,6 +1,6 @@
 """Checks of demonstrations and learned concepts against a model."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,13 +10,15 @@ from torch import Tensor
 
 from ftl_lightning.data.check import Finding, axes, check
 from ftl_lightning.data.demonstrations import Demonstrations, paths_of
+from ftl_lightning.data.enough import Enough
 from ftl_lightning.data.features import moved
+from ftl_lightning.data.odd import Oddness
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.igm.explanation import formula
-from ftl_lightning.igm.forms.choice import combined
+from ftl_lightning.igm.forms.choice import SIMPLEST, combined, learn
 from ftl_lightning.igm.forms.combination import Combination
-from ftl_lightning.igm.forms.leave_one_out import LeaveOneOut, leave_one_out, relative_losses
-from ftl_lightning.igm.settings import InversionSettings
+from ftl_lightning.igm.forms.leave_one_out import LeaveOneOut, leave_one_out, odd_one, relative_losses
+from ftl_lightning.igm.settings import AUTO, InversionSettings
 from ftl_lightning.services.errors import about, require, short
 from ftl_lightning.services.progress import bar
 from ftl_lightning.services.text import alike, counted
@@ -75,6 +77,8 @@ class Check:
         known: the training concept that explains them best; ``None`` without a model.
         left_out: leave-one-out losses; ``None`` without learning.
         combination: report on weighted sums of training concepts; empty without a model of a user's data.
+        enough: whether the demonstrations suffice, by skill; ``None`` for fewer than three, or with a model of a shipped domain.
+        by_loss: whether losses of left-out demonstrations decide instead.
     """
 
     name: str
@@ -83,6 +87,8 @@ class Check:
     known: Known | None = None
     left_out: LeaveOneOut | None = None
     combination: str = ""
+    enough: Enough | None = None
+    by_loss: bool = True
 
     @property
     def warnings(self) -> tuple[Finding, ...]:
@@ -101,7 +107,8 @@ class Check:
         lines += findings if rest <= 0 else [*findings[:MOST_FAULTS], f"  and {rest} more"]
         lines += [] if self.known is None else [f"  {self.known}"]
         lines += [f"  {self.combination}"] if self.combination else []
-        lines += [] if self.left_out is None else [f"  {line}" for line in self.left_out.lines() if line]
+        lines += [] if self.left_out is None else [f"  {line}" for line in self.left_out.lines(self.by_loss) if line]
+        lines += [] if self.enough is None else [f"  {self.enough}"]
         return "\n".join(lines)
 
 
@@ -165,12 +172,32 @@ def check_with(
     titled, total = f"{name}: training concepts", len(model.config.training_concepts)
     with bar(titled, total, lines=False) if progress else nothing as advance:
         known = known_as(model, demonstrations, settings, advance)
-    left: LeaveOneOut | None = None
+    own, left, learned, odd = model.examples, None, None, None
+    if own is not None and (odd := Oddness(own, model.horizon).odd(demonstrations)) is not None:
+        faults = (*faults, Finding("differs from the others more than is usual within a concept; another concept?", rows=(odd,)))
     if steps and len(demonstrations) > 1:
+        find_odd = odd_one if own is None else lambda losses: odd
         with bar(f"{name}: learning from some", steps) if progress else nothing as advance:
-            left = leave_one_out(model, demonstrations, settings, steps, lambda loss: advance(1, f"loss {loss:.3g}"))
+            left = leave_one_out(model, demonstrations, settings, steps, lambda loss: advance(1, f"loss {loss:.3g}"), find_odd)
+        learned = None if own is None else _best_learned(model, demonstrations, settings, steps)
+    enough = None if own is None else Enough.of(demonstrations, model.horizon, own, learned, faulty(faults))
     ordered = tuple(sorted(faults, key=lambda finding: finding.severity == "note"))
-    return Check(name, demonstrations, ordered, known, left, combination_line(model, demonstrations, settings))
+    return Check(name, demonstrations, ordered, known, left, combination_line(model, demonstrations, settings), enough, own is None)
+
+
+def faulty(findings: Iterable[Finding]) -> set[int]:
+    """Demonstrations that are likely faulty; of copies, all but the first."""
+    return {row for finding in findings if finding.severity != "note" for row in finding.rows[len(finding.rows) > 1 :]}
+
+
+def _best_learned(
+    model: ConceptModel, demonstrations: Demonstrations, settings: InversionSettings, steps: int
+) -> tuple[str, float] | None:
+    """The learned form with the highest skill, if it is better than every reference, and its skill."""
+    (concept,) = learn(model, demonstrations, settings.changed(form=AUTO), steps).values()
+    skills = {} if concept.choice is None else concept.choice.skills
+    best = max(skills, key=lambda name: skills[name], default="")
+    return (best, skills[best]) if best in SIMPLEST else None
 
 
 def combination_line(model: ConceptModel, demonstrations: Demonstrations, settings: InversionSettings) -> str:

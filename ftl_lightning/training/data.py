@@ -18,7 +18,7 @@ from ftl_lightning.data.check import check_each
 from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.data.features import check_features
 from ftl_lightning.domains.domain import OWN, Domain, Recoveries
-from ftl_lightning.domains.from_file import FileSource, domain_from_file, read_demonstrations, read_own
+from ftl_lightning.domains.from_file import RECOGNISED, FileSource, domain_from_file, read_demonstrations, read_own
 from ftl_lightning.domains.registry import load_domain, recorded_name
 from ftl_lightning.networks.text_encoder import Encoder, load_encoder
 from ftl_lightning.services.errors import UserError, note, require, short
@@ -26,6 +26,7 @@ from ftl_lightning.services.modes import single_precision
 from ftl_lightning.services.randomness import DEMONSTRATION_SEED, drawn, generator, rows_of
 from ftl_lightning.services.text import alike
 from ftl_lightning.services.validation import LARGEST_STEP, MOST_TOGETHER, check_count, check_factor, check_range
+from ftl_lightning.training.quality import calibration_of
 
 
 class Batch(NamedTuple):
@@ -303,6 +304,9 @@ class OwnData(PretrainingData):
 
     def setup(self, stage: str) -> None:
         super().setup(stage)
+        if stage == "fit" and RECOGNISED in self.metrics:
+            text = calibration_of(self.domain, self.domain.concepts.training[0], RECOGNISED)
+            note(f"{self._file}: {text if text.startswith(RECOGNISED) else f'{RECOGNISED} {text}'}")
         if self._check and stage == "fit":
             for text in check_each(self.training):
                 note(f"{self._file}: {text}; --data.check false turns this off")

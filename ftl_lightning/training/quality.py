@@ -15,7 +15,7 @@ from ftl_lightning.domains.from_file import own_domain
 from ftl_lightning.domains.pictures import Drawn, beside
 from ftl_lightning.igm.concept import Concept, QualityRecord
 from ftl_lightning.igm.forms.quality import Quality, encoded, generated, observed_from
-from ftl_lightning.services.errors import require
+from ftl_lightning.services.errors import note, require
 from ftl_lightning.training.concept_model import ConceptModel
 
 if TYPE_CHECKING:
@@ -38,16 +38,37 @@ def judging_domain(model: ConceptModel, examples: Sequence[Demonstrations]) -> D
     return own_domain(concatenate(examples), config.training_concepts, config.horizon, config.metrics)
 
 
+def calibration_of(domain: Domain, goal: str, name: str | None = None) -> str:
+    """How often a metric accepts real behaviour of a goal, or why it is not measured; empty for a rule.
+
+    Args:
+        name: the metric; ``None`` for the first that is calibrated.
+    """
+    for metric in domain.metrics.values() if name is None else (domain.metrics[name],):
+        if metric.calibration is not None:
+            return metric.calibration(goal)
+    return ""
+
+
 def judged(domain: Domain, plans: Demonstrations, goal: str) -> dict[str, float]:
-    """Evaluate plans by the domain's metrics: success rates or means by name.
+    """Evaluate plans by the domain's metrics: success rates or means by name, without metrics that are not measured.
 
     Raises:
         UserError: for a goal that the domain cannot judge, or a domain without metrics.
+
+    Warns:
+        UserWarning: with the reason why a metric is not measured.
     """
     require(domain.metrics, "evaluate", "a domain that judges plans", f"{domain.name}; execute them")
     domain.check_goal(goal)
     measured = domain.measure(goal, plans.states, plans.initial_states)
-    return {name: float(values.float().mean()) for name, values in measured.items()}
+    means = {}
+    for name, values in measured.items():
+        if values.isnan().all() and (reason := calibration_of(domain, goal, name)):
+            note(reason)
+        else:
+            means[name] = float(values.float().mean())
+    return means
 
 
 def picture(domain: Domain, plans: Demonstrations, goal: str = "") -> "Figure":
@@ -77,6 +98,7 @@ class Inspection:
         domain: domain that draws the pictures.
         name: name of the concept.
         skill: skill of the form beside references; empty if it was not measured.
+        calibration: how often the metric accepts real behaviour, or why it is not shown; empty for a rule.
     """
 
     quality: Quality
@@ -87,11 +109,14 @@ class Inspection:
     domain: Domain
     name: str
     skill: str = ""
+    calibration: str = ""
 
     def __str__(self) -> str:
-        metric = "" if self.right is None else f"{self.right[0]} {self.right[1]:.2f}, "
+        about = f" ({self.calibration})" if self.calibration else ""
+        metric = "" if self.right is None else f"{self.right[0]} {self.right[1]:.2f}{about}, "
         skill = f"{self.skill}; " if self.skill else ""
-        return f"{skill}{metric}{self.quality.words} ({len(self.samples)} samples)"
+        hidden = f"; {self.calibration}" if self.right is None and self.calibration else ""
+        return f"{skill}{metric}{self.quality.words} ({len(self.samples)} samples){hidden}"
 
     @property
     def record(self) -> QualityRecord:
@@ -124,11 +149,12 @@ def inspected(model: ConceptModel, domain: Domain, demonstrations: Demonstration
     name = concept.origin.name
     samples, starts = generated(model, demonstrations, {name: concept}, seed=0)
     plans, known, first = samples[name], first_windows(demonstrations, model.config.horizon), demonstrations.initial_states
-    right = None
+    right, calibration = None, ""
     if domain.concepts.reads(name):
         right = right_plans(domain.measure(name, plans, starts if domain.observed else None))
+        calibration = calibration_of(domain, name, None if right is None else right[0])
     observed = observed_from(demonstrations)
     quality = Quality.of(encoded(model, plans, starts), encoded(model, known, first), observed)
     success = None if right is None else (right[0], float(right[1].float().mean()))
     skill = "" if concept.choice is None else concept.choice.words
-    return Inspection(quality, success, known, plans, starts, domain, name, skill)
+    return Inspection(quality, success, known, plans, starts, domain, name, skill, calibration)

@@ -1,5 +1,6 @@
 """A file of demonstrations with texts is a domain."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +22,11 @@ from ftl_lightning.igm.settings import BudgetOptions
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.methods.ftl_igm.pretraining import PretrainingModule
 from ftl_lightning.networks.text_encoder import HashingEncoder
-from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.errors import Note, UserError
 from ftl_lightning.training.data import InversionData, OwnData
 from ftl_lightning.training.inversion_module import InversionModule
 from ftl_lightning.training.model_folder import load_model, save_model
+from ftl_lightning.training.quality import calibration_of, judged, right_plans
 from ftl_lightning.training.trainer import Trainer
 
 SLOPES = {"go right": (1.0, 0.0), "go up": (0.0, 1.0), "go between": (0.5, 0.5)}
@@ -80,15 +82,20 @@ def test_a_file_is_a_domain_which_has_no_headline_without_metrics(file: str) -> 
     assert domain.concepts.training == ("go right",)
 
 
-def test_the_last_demonstrations_of_each_concept_are_held_out_and_a_task_has_the_first(file: str) -> None:
+def test_random_demonstrations_of_each_concept_are_held_out_and_a_task_has_the_first(file: str) -> None:
     everything = Demonstrations.load(file)
     for share, held in ((0.01, 1), (0.1, 1), (0.34, 2), (0.5, 3)):
         source = domain_from_file(file, None, {}, share).source(None)
         train, validation = (source.split(name, 99, 0) for name in ("train", "validation"))  # type: ignore[arg-type]
         assert validation.concepts == ("go right",) * held + ("go up",) * held
-        assert torch.equal(validation.states, everything.states[[*range(6 - held, 6), *range(12 - held, 12)]])
-        assert len(train) == 12 - 2 * held
-        assert torch.equal(source.split("train", 1, 7).states, train.states)  # count and seed are the file's matter
+        rows = [bytes(states.numpy()) for states in everything.states]
+        out = [rows.index(bytes(states.numpy())) for states in validation.states]
+        assert out == sorted(set(out))
+        assert [row < 6 for row in out] == [True] * held + [False] * held
+        assert sorted([*out, *(rows.index(bytes(states.numpy())) for states in train.states)]) == list(range(12))
+        assert domain_from_file(file, None, {}, share).source(None).split("validation", 9, 9).hash == validation.hash
+    assert out != [3, 4, 5, 9, 10, 11]  # not the last, which may be of another session
+    assert torch.equal(source.split("train", 1, 7).states, train.states)  # count and seed are the file's matter
     source = domain_from_file(file, None, {}, 0.1).source(None)
     assert torch.equal(source.draw("go up", 2, 0).states, everything.states[6:8])
     for task, count, found in (("go up", 7, 6), ("go between", 1, 0)):
@@ -97,13 +104,41 @@ def test_the_last_demonstrations_of_each_concept_are_held_out_and_a_task_has_the
     assert source.starts("go up", 3, 0) is None
 
 
+def test_recognised_is_shown_only_where_ten_held_out_demonstrations_of_each_concept_calibrate_it(tmp_path: Path) -> None:
+    for held, shown in ((10, True), (9, False)):
+        known = examples(go_right=walks("go right", held), go_up=walks("go up", 10, 1), go_between=walks("go between", 5, 2))
+        domain = own_domain(known, ("go right", "go up"), TIME, {"recognised": 0.98, "end_point_within": 1.0})
+        plans = examples(go_between=walks("go between", 20, 3))
+        assert (right_plans(domain.measure("go between", plans.states, None)) or ("", 0))[0] == METRIC[shown]
+        text = calibration_of(domain, "go between")
+        if shown:
+            assert re.fullmatch(r"accepts [01]\.\d\d of held-out demonstrations by 5 others of their concept", text)
+            assert judged(domain, plans, "go between")["recognised"] > 0.5
+            continue
+        assert text == (
+            "recognised is not shown: 'go right' has 9 held-out demonstrations, 10 of each training concept calibrate it"
+        )
+        with pytest.warns(Note, match="recognised is not shown"):
+            assert list(judged(domain, plans, "go between")) == ["end_point_within"]
+    few = write(tmp_path / "few.npz")
+    with pytest.warns(Note, match="few.npz: recognised is not shown: 'go right' has 1 held-out demonstration, 10 of"):
+        OwnData(few, {"recognised": 0.98}, encoder="hashing").setup("fit")
+    many = write(tmp_path / "many.npz", count=20)
+    with pytest.warns(Note, match=r"many.npz: recognised accepts [01]\.\d\d of held-out demonstrations by 10 others"):
+        OwnData(many, {"recognised": 0.98}, validation_share=0.5, encoder="hashing").setup("fit")
+
+
+METRIC = {True: "recognised", False: "end_point_within"}
+
+
 def test_initial_states_are_those_of_held_out_demonstrations(tmp_path: Path) -> None:
     places = np.arange(12.0)[:, None]
     domain = domain_from_file(write(tmp_path / "w.npz", **{"observed/place": places}), None, {}, 0.34)
     assert domain.observed == {"place": Feature((1,))}
     starts = domain.source(None).starts("go up", 50, 3)
     assert starts is not None
-    assert set(starts.observed["place"].flatten().tolist()) == {4.0, 5.0, 10.0, 11.0}
+    held_out = domain.source(None).split("validation", 0, 0).observed["place"]
+    assert set(starts.observed["place"].flatten().tolist()) == set(held_out.flatten().tolist())
     again, other = (domain.source(None).starts("go up", 50, seed) for seed in (3, 4))
     assert again is not None
     assert other is not None

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.from_file import METRICS
+from ftl_lightning.domains.recognition import Recognition
 from ftl_lightning.services.errors import UserError
 from tests.conftest import ROOT
 
@@ -236,3 +237,18 @@ def test_more_is_accepted_the_greater_the_share_and_plans_that_are_not_finite_ar
     assert found.tolist() == [False, False, True]
     settings = yaml.safe_load((ROOT / "conf" / "own.yaml").read_text("utf-8"))
     assert settings["fit"]["data"]["init_args"]["metrics"] == {"recognised": 0.98}
+
+
+def test_the_acceptance_of_fresh_behaviour_is_estimated_from_the_examples() -> None:
+    for count, share in ((10, 0.98), (10, 0.6), (3, 0.98)):
+        draw = np.random.default_rng(count)
+        known, fresh = (
+            {name: draw.normal(size=(some, 1, 4)) @ np.diag((1, 1, 0.3, 0.3)) + 2 * number for number, name in enumerate("abcdef")}
+            for some in (count, 200)
+        )
+        states = torch.from_numpy(np.concatenate(list(known.values()))).float()
+        texts = tuple(name for name, some in known.items() for _ in some)
+        examples = Demonstrations(states, torch.ones(len(states), dtype=torch.int64), "", tuple("wxyz"), ("",) * 4, texts)
+        recognition = Recognition(examples, 1, share)
+        accepted = np.mean([recognition.recognised(name, torch.from_numpy(some)).float().mean() for name, some in fresh.items()])
+        assert recognition.acceptance(count) == pytest.approx(accepted, abs=0.15)

@@ -13,18 +13,22 @@ from ftl_lightning.apps.play.requests import Sample
 from ftl_lightning.apps.play.same import Sampled
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import InitialStates
+from ftl_lightning.data.outline import Outline
 from ftl_lightning.domains.domain import SUCCESS, Domain
 from ftl_lightning.domains.execution import Rollout
 from ftl_lightning.domains.films import VectorFilm
+from ftl_lightning.domains.from_file import FileSource
 from ftl_lightning.domains.pictures import Show, line_film
 from ftl_lightning.evaluation.pictures import packed, packed_space
 from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.services.errors import UserError, short
+from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.quality import judging_domain, right_plans
 
 Json = dict[str, Any]
 STEPS = 10  # maximum number of sampling steps, so that a moving slider is answered at once
+PARTS = "parts"  # name of the judgement that no part of a path is missing
 JOINED = " and "  # separator of the names of mixed concepts, for domains that read the result as a goal
 
 
@@ -73,9 +77,29 @@ def judge_of(model: FewShot, examples: Sequence[Demonstrations]) -> Domain:
     return judging_domain(model.model, [*([] if base is None else [base]), *examples])
 
 
-def judged(domain: Domain, plans: Demonstrations, goal: str) -> tuple[list[Json], str]:
-    """Films of samples, and the fraction of correct samples in words; empty without a goal, or if not judged."""
+@functools.lru_cache(maxsize=2)
+def _outline(model: ConceptModel) -> Outline | None:
+    """Judge of the parts of paths of a user's data; ``None`` for a shipped domain."""
+    return None if model.examples is None else Outline(model.examples, model.horizon)
+
+
+def _whole(model: ConceptModel, domain: Domain, plans: Demonstrations, goal: str) -> Tensor | None:
+    """Whether no part of each sample is missing or added ``(sample,)``; ``None`` for a shipped domain."""
+    outline = _outline(model)
+    if outline is None:
+        return None
+    source = domain.source(None)
+    assert isinstance(source, FileSource)
+    return outline.whole(plans.states, plans.initial_states.observed, source.demonstrations.select(goal))
+
+
+def judged(model: ConceptModel, domain: Domain, plans: Demonstrations, goal: str) -> tuple[list[Json], str]:
+    """Films of samples, and the fraction of correct samples in words; empty without a goal, or if not judged. Samples of a user's
+    data are also compared with the demonstrations part by part.
+    """
     success = right_plans(domain.measure(goal, plans.states, plans.initial_states)) if goal else None
+    if goal and (whole := _whole(model, domain, plans, goal)) is not None:
+        success = (PARTS, whole) if success is None else (f"{success[0]}, {PARTS}", success[1] & whole)
     if success is None:
         return films(domain, plans), ""
     name, right = success
@@ -95,7 +119,7 @@ def samples(model: FewShot, mixture: Mixture, asked: Sample, tasks: Sequence[str
     goal = goal_of(judge, mixture.names, asked.task)
     if not asked.execute:
         plans = model.sample(mixture.mixed, asked.count, starts, seed=asked.seed, **how)
-        played, verdict = judged(judge, plans, goal)
+        played, verdict = judged(model.model, judge, plans, goal)
     elif starts is None:
         raise UserError(f"execute: expected a model whose behaviour is executed, found {model.domain.name}")
     else:

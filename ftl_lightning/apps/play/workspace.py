@@ -294,7 +294,7 @@ class Workspace:
         task, starts = starts_of(self._model, (self._demonstrating.task,), count, 0)
         plans = self._model.sample(concept, count, starts, seed=0, **sampling_of(self._model))
         judge = judge_of(self._model, [demonstrations])
-        return judged(judge, plans, goal_of(judge, (concept.concept.origin.name,), task))
+        return judged(self._model.model, judge, plans, goal_of(judge, (concept.concept.origin.name,), task))
 
     def thumbnail(self, key: str) -> Json:
         """Film of a sample of a concept."""

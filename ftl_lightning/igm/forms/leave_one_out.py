@@ -169,8 +169,8 @@ class LeaveOneOut:
         (fewer, before), (more, after) = ([(0, 1.0), *self.curve.items()])[-2:]
         return before - after > FALLING * (more - fewer) * before
 
-    def lines(self) -> list[str]:
-        """Report, one line for each result."""
+    def lines(self, judged: bool = True) -> list[str]:
+        """Report, one line for each result; ``judged`` is whether losses decide if the demonstrations suffice."""
         count = len(self.left_out)
         out, inside = sum(self.left_out) / count, sum(self.learned_from) / count
         summary = f"left out: the concept learned from the others explains {self.covered} of {count}"
@@ -187,7 +187,7 @@ class LeaveOneOut:
         verdict = "still falls: more are likely to help" if self.falling else "hardly falls any more: these suffice"
         if not self.falling and [1.0, *self.curve.values()][-1] >= COVERED:
             verdict = "hardly falls, and those left out are not explained: look at samples"
-        more = f"more: loss of those left out {curve}; it {verdict}" if curve else ""
+        more = f"more: loss of those left out {curve}{f'; it {verdict}' if judged else ''}" if curve else ""
         times = f"where it is learned from them, they have {self.distance:.1f} times the loss of what the model generates"
         near = f"distance: {times} (from {FAR:.0f} on: far from anything pretrained)"
         far = f"far: {times}: nothing pretrained is like this; look at samples, they may do something else"
@@ -238,14 +238,29 @@ def quickly(settings: InversionSettings) -> InversionSettings:
     )
 
 
+def odd_one(losses: Tensor) -> int | None:
+    """Index of the demonstration with a left-out loss ``(demo,)`` far above the others'; ``None`` without any."""
+    if len(losses) < 3:
+        return None
+    worst = int(losses.argmax())
+    others = torch.cat((losses[:worst], losses[worst + 1 :]))
+    return worst if losses[worst] > max(ODD * float(others.max()), HARMED) else None
+
+
 def leave_one_out(
-    model: Invertible, demonstrations: Demonstrations, settings: InversionSettings, steps: int, tell: Tell = lambda loss: None
+    model: Invertible,
+    demonstrations: Demonstrations,
+    settings: InversionSettings,
+    steps: int,
+    tell: Tell = lambda loss: None,
+    find_odd: Callable[[Tensor], int | None] = odd_one,
 ) -> LeaveOneOut:
     """Learn the concept from subsets, in one batch, and measure each on the left-out demonstrations.
 
     Args:
         demonstrations: two or more of one concept; the first :data:`MOST` are used.
         settings: settings of the inversion; modes, adapters and restarts are ignored.
+        find_odd: index of the odd demonstration by the left-out losses ``(demo,)``, or ``None``.
     """
     count = min(len(demonstrations), MOST)
     used, chosen = demonstrations.rows(list(range(count))), subsets(count)
@@ -255,7 +270,7 @@ def leave_one_out(
     last = sizes == count - 1
     outside = torch.where(without[last], losses[last], 0).sum(dim=0)
     inside = torch.where(~without[last], losses[last], 0).sum(dim=0) / max(count - 1, 1)
-    odd = odd_one(outside)
+    odd = find_odd(outside)
     kept = without.clone()
     if odd is not None:
         kept[:, odd] = False
@@ -266,12 +281,3 @@ def leave_one_out(
         if kept[sizes == size].any()
     }
     return LeaveOneOut(tuple(outside.tolist()), tuple(inside.tolist()), curve, odd, generated_loss(model, used, settings))
-
-
-def odd_one(losses: Tensor) -> int | None:
-    """Index of the demonstration with a left-out loss ``(demo,)`` far above the others'; ``None`` without any."""
-    if len(losses) < 3:
-        return None
-    worst = int(losses.argmax())
-    others = torch.cat((losses[:worst], losses[worst + 1 :]))
-    return worst if losses[worst] > max(ODD * float(others.max()), HARMED) else None
