@@ -5,7 +5,8 @@
 The sets are those of ``real_data.py``. A model of each is pretrained with ``conf/own.yaml`` on 60 demonstrations of each kind,
 unless it is in ``--models``. Then each new kind is learned from five demonstrations with default settings. The *truth* is the share
 of 100 new samples that are right by the set's rule, or the mean F1 of two classifiers that are trained on 50 samples and tested on
-real behaviour. The truth of warped demonstrations is measured, too. A table is written beside the results.
+real behaviour. It is measured for the chosen form and for other forms, two of which need no learning. The *score* is the energy
+score on fresh behaviour, lower is better. A table is written beside the results.
 """
 
 import argparse
@@ -14,17 +15,30 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from statistics import mean
+from statistics import mean, stdev
+from typing import Any
 
 import torch
 from real_data import FEW, FEW_SEED, FRESH_SEED, NAMES, REAL, RULE, RealSet, sets
+from scipy.stats import spearmanr
+from torch import Tensor
 
-from ftl_lightning.data.references import WARPED
+from ftl_lightning.data import references
+from ftl_lightning.data.energy import PathFeatures
+from ftl_lightning.data.places import first_windows
+from ftl_lightning.data.references import GAUSSIAN, WARPED, Reference, Setting
+from ftl_lightning.few_shot.learned_concept import LearnedConcept
 from ftl_lightning.few_shot.learner import FewShot
-from ftl_lightning.igm.forms.choice import SIMPLEST
+from ftl_lightning.igm.forms.choice import SKILLED, SKILLED_STEPS
+from ftl_lightning.igm.settings import ADAPTED, COMBINED, ONE
 
-SHOWN = 100
-"""Samples that a rule judges."""
+SHOWN, EACH = 100, 8
+"""Fresh demonstrations of a rule's set, and samples for each, of which a rule judges one."""
+FORMS: dict[str, dict[str, Any]] = {
+    **{form: {} for form in (COMBINED, ONE, WARPED, GAUSSIAN)},
+    ADAPTED: {**SKILLED, "steps": SKILLED_STEPS},
+}
+"""Forms whose truth is measured, too, with their settings."""
 
 
 def pretrained(data: RealSet, models: Path) -> FewShot:
@@ -42,45 +56,70 @@ def pretrained(data: RealSet, models: Path) -> FewShot:
 
 
 def measured(data: RealSet, model: FewShot, kind: str, draw: int) -> dict[str, object]:
-    """Form, skills and truth of one new kind and draw of five."""
+    """Form, skills, scores on fresh behaviour, and truth, of one new kind and draw of five."""
     five = data.demonstrations(kind, FEW, FEW_SEED + draw)
-    count = SHOWN if data.judge == RULE else REAL
-    observed = data.demonstrations(kind, count, FRESH_SEED + draw).initial_states.observed
+    fresh = data.demonstrations(kind, SHOWN if data.judge == RULE else REAL, FRESH_SEED + draw)
+    observed, count = fresh.initial_states.observed, len(fresh)
     begin = time.process_time()
     learned = model.learn(five, name=kind)
     seconds = time.process_time() - begin
-    truth = {}
-    for name, concept in {"chosen": learned, WARPED: model.learn(five, name=kind, form=WARPED, steps=1)}.items():
-        if observed:
-            plans = model.sample(concept, observed=observed, seed=draw).states
-        else:
-            plans = model.sample(concept, count=count, seed=draw).states
-        samples = data.of(list(plans.double().numpy()), {key: some.numpy() for key, some in observed.items()}, kind)
-        truth[name] = round(data.right(kind, samples, seed=draw), 4)
-    choice = learned.concept.choice
+    choice, examples = learned.concept.choice, model.model.examples
     assert choice is not None
+    assert examples is not None
+    horizon = model.model.horizon
+    features, real = PathFeatures(first_windows(examples, horizon).float()), first_windows(fresh, horizon).float()
+    starts = fresh.initial_states.take(torch.arange(count).repeat_interleave(EACH)).observed
+
+    def score(plans: Tensor) -> float:
+        return round(float(features.scores(plans.float().unflatten(0, (count, EACH)), real).mean()), 4)
+
+    def sampled(concept: LearnedConcept) -> Tensor:
+        if observed:
+            return model.sample(concept, observed=starts, seed=draw).states
+        return model.sample(concept, count=count * EACH, seed=draw).states
+
+    concepts = {"chosen": learned} | {name: model.learn(five, name=kind, form=name, **options) for name, options in FORMS.items()}
+    plans = {name: sampled(concept) for name, concept in concepts.items()}
+    setting, truth, scores = Setting.of(examples, horizon), {}, {"chosen": score(plans["chosen"])}
+    for name in references.NAMES:
+        draws = torch.Generator().manual_seed(draw)
+        scores[name] = score(Reference.of(name, five, setting, horizon).sample(starts, count * EACH, draws))
+    for name, states in plans.items():
+        some = list(states[::EACH].double().numpy())
+        samples = data.of(some, {key: values.numpy() for key, values in observed.items()}, kind)
+        truth[name] = round(data.right(kind, samples, seed=draw), 4)
     row = {"set": data.name, "kind": kind, "draw": draw, "judge": data.judge, "form": choice.form, "seconds": round(seconds, 1)}
-    return {**row, "truth": truth, "skill": choice.skills}
+    return {**row, "truth": truth, "score": scores, "skill": choice.skills}
 
 
-def table(rows: list[dict[str, object]]) -> str:
+def correlation(rows: list[dict[str, Any]]) -> tuple[float, int]:
+    """Spearman's rank correlation of skill with truth, over all forms of all cells, and their number."""
+    pairs = [(row["skill"][name], row["truth"][name]) for row in rows for name in FORMS if name in row["skill"]]
+    return float(spearmanr(pairs).statistic), len(pairs)
+
+
+def ahead(rows: list[dict[str, Any]]) -> int:
+    """Standard errors by which the chosen form's score on fresh behaviour is better than the best reference's, paired over cells."""
+    best = min(references.NAMES, key=lambda name: mean(row["score"][name] for row in rows))
+    gains = [row["score"][best] - row["score"]["chosen"] for row in rows]
+    return round(mean(gains) / max(stdev(gains) / len(gains) ** 0.5, 1e-9)) if len(gains) > 1 else 0
+
+
+def table(rows: list[dict[str, Any]]) -> str:
     """Means by set, and the forms that were chosen."""
     lines = [
-        "| set | truth, form chosen | truth, warped | skill, best learned form | skill, warped | forms chosen |",
-        "|---|---|---|---|---|---|",
+        "| set | truth: chosen | warped | Gaussian | adapter | one set | score: chosen | best reference | ahead by | forms |",
+        "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for name in dict.fromkeys(str(row["set"]) for row in rows):
         some = [row for row in rows if row["set"] == name]
-        truths, skills = [row["truth"] for row in some], [row["skill"] for row in some]
-        numbers = [
-            mean(truth["chosen"] for truth in truths),  # type: ignore[index]
-            mean(truth[WARPED] for truth in truths),  # type: ignore[index]
-            mean(max(skill[form] for form in SIMPLEST if form in skill) for skill in skills),  # type: ignore[index, operator]
-            mean(skill[WARPED] for skill in skills),  # type: ignore[index]
-        ]
+        numbers = [mean(row["truth"][form] for row in some) for form in ("chosen", WARPED, GAUSSIAN, ADAPTED, ONE)]
+        scores = [mean(row["score"][form] for row in some) for form in ("chosen", *references.NAMES)]
         forms = ", ".join(sorted({str(row["form"]) for row in some}))
-        lines.append(f"| {name} | {' | '.join(f'{number:.2f}' for number in numbers)} | {forms} |")
-    return "\n".join(lines) + "\n"
+        shown = [f"{number:.2f}" for number in numbers] + [f"{scores[0]:.3f}", f"{min(scores[1:]):.3f}", f"{ahead(some)} s.e."]
+        lines.append(f"| {name} | {' | '.join(shown)} | {forms} |")
+    value, count = correlation(rows)
+    return "\n".join(lines) + f"\n\nRank correlation of skill with truth: {value:.2f}, over {count} forms of {len(rows)} cells.\n"
 
 
 def main() -> None:

@@ -13,8 +13,10 @@ from torch.nn import functional
 
 from ftl_lightning.services.randomness import generator
 
-FEATURES = ("path", "differences", "convolutions", "spectrum")
-"""Features of a path, each with an energy score."""
+FEATURES = ("path", "differences", "convolutions", "spectrum", "precision")
+"""Features of a path, each with an energy score. The last is measured where ``within`` is known."""
+FLOOR = 0.02
+"""Smallest standard deviation within concepts, relative to that of a column: what is smaller is no matter of precision."""
 KERNELS, WIDTH = 100, 7
 """Random convolutions, and their number of times."""
 QUIET = 1e-3
@@ -28,13 +30,16 @@ class PathFeatures:
 
     Args:
         real: paths ``(path, horizon, state)``, such as those of all training concepts; two or more.
+        within: standard deviation of each time and column within concepts ``(horizon, state)``. Paths in these units see where
+            behaviour is precise; ``None`` leaves this feature out.
 
     Attributes:
         units: mean distance between real paths, of each feature.
     """
 
-    def __init__(self, real: Tensor) -> None:
+    def __init__(self, real: Tensor, within: Tensor | None = None) -> None:
         self.spread = _spread(real.flatten(0, 1))
+        self.precision = None if within is None else torch.maximum(within, FLOOR * self.spread)
         draw = generator("cpu", 0, 7)
         state, horizon = real.shape[2], real.shape[1]
         width = min(WIDTH, horizon)
@@ -49,10 +54,11 @@ class PathFeatures:
         self.units = [_mean_distance(values) for values in self(real[some])]
 
     def __call__(self, paths: Tensor) -> list[Tensor]:
-        """Features ``(path, n)`` of paths ``(path, horizon, state)``, by :data:`FEATURES`; short paths have the first alone."""
+        """Features ``(path, n)`` of paths ``(path, horizon, state)``, by :data:`FEATURES`; short paths have the first and last."""
         scaled = paths / self.spread
+        precise = [] if self.precision is None else [(paths / self.precision).flatten(1)]
         if paths.shape[1] < 3:
-            return [scaled.flatten(1)]
+            return [scaled.flatten(1), *precise]
         convolved = []
         for dilation, chosen in self.dilations.items():
             values = functional.conv1d(scaled.transpose(1, 2), self.kernels[chosen], dilation=dilation)
@@ -65,6 +71,7 @@ class PathFeatures:
             scaled.diff(dim=1).flatten(1),
             torch.cat(convolved, dim=1),
             (amplitudes + quiet).log().flatten(1),
+            *precise,
         ]
 
     def scores(self, samples: Tensor, truth: Tensor) -> Tensor:

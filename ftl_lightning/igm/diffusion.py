@@ -19,7 +19,7 @@ LARGEST_POWER = 100.0
 """Maximum power of :func:`timesteps`; a larger power gives almost only timestep T - 1."""
 MOST_STEPS = 100_000
 """Maximum length T of a schedule."""
-PREDICTIONS = ("epsilon", "v", "clean", "displacement", "cosines", "remainder")
+PREDICTIONS = ("epsilon", "v", "clean", "displacement", "cosines")
 """Prediction targets of a network, see :class:`Prediction`; ``'epsilon'``, the noise, is the paper's."""
 LOSSES = PREDICTIONS[:3]
 """Quantities whose squared error is the loss, see :func:`loss_weights`; ``'epsilon'`` is the paper's."""
@@ -89,7 +89,7 @@ def clean_from_epsilon(noisy: Tensor, epsilon: Tensor, alpha_bar: Tensor, clip: 
 
 
 def denoising_loss(
-    epsilon: Callable[[Tensor, Tensor], Tensor], clean: Tensor, noise: Tensor, t: Tensor, alpha_bar: Tensor, discount: float = 1.0, metric=None
+    epsilon: Callable[[Tensor, Tensor], Tensor], clean: Tensor, noise: Tensor, t: Tensor, alpha_bar: Tensor, discount: float = 1.0
 ) -> Tensor:
     """Denoising loss ``|eps - eps_theta(x_t, t)|^2`` of each sample (Eq. 1; with the composed noise estimate, Eq. 2).
 
@@ -103,8 +103,7 @@ def denoising_loss(
     Returns:
         ``(batch,)``, the mean over the states of a plan and their columns.
     """
-    error = epsilon(add_noise(clean, noise, alpha_bar[t]), t) - noise
-    squared = (error if metric is None else metric(error)).square()
+    squared = (epsilon(add_noise(clean, noise, alpha_bar[t]), t) - noise).square()
     if discount != 1:
         weights = discount ** torch.arange(clean.shape[1], device=clean.device)
         squared = squared * (weights / weights.mean())[:, None]
@@ -168,20 +167,7 @@ class Prediction(nn.Module):
         """Estimate the noise, see :data:`Denoiser`."""
         alpha_bar = self.alpha_bar[t][:, None, None]
         start, context = (context[0], context[1:]) if self.kind == "displacement" else (None, context)
-        if self.kind == "remainder" and self.spectrum is not None:
-            import os
-
-            white = self.spectrum.whitened(x, alpha_bar)
-            if os.environ.get("VAR", "z") == "z":
-                out = self.net(white, t, concepts, index, context)
-            elif os.environ["VAR"] == "zt":
-                out = self.net(torch.einsum("ct,bcs->bts", self.spectrum.basis, white), t, concepts, index, context)
-                out = torch.einsum("ct,bts->bcs", self.spectrum.basis, out)
-            else:
-                out = self.net(x, t, concepts, index, context)
-            out = self.spectrum.posterior(out, white, alpha_bar)
-            return (x - alpha_bar.sqrt() * out) / (1 - alpha_bar).sqrt()
-        out = self.net(x, t, concepts, index, context)
+        out: Tensor = self.net(x, t, concepts, index, context)
         if self.kind == "v":
             return alpha_bar.sqrt() * out + (1 - alpha_bar).sqrt() * x
         if self.spectrum is not None:

@@ -64,26 +64,6 @@ class Spectrum(nn.Module):
         self.mean.copy_(coefficients.mean(dim=0))
         self.scale.copy_(torch.where(varies, spread, 0))
 
-    def whitened(self, x: Tensor, alpha_bar: Tensor) -> Tensor:
-        """Coefficients of noisy plans ``x (batch, horizon, state)``, with mean 0 and variance 1 in pretraining.
-
-        ``alpha_bar (batch, 1, 1)`` is the share of the clean plan in the variance of ``x``.
-        """
-        coefficients = torch.einsum("ct,bts->bcs", self.basis, x)
-        return (coefficients - alpha_bar.sqrt() * self.mean) / self._deviation(alpha_bar)
-
-    def _deviation(self, alpha_bar: Tensor) -> Tensor:
-        return (alpha_bar * self.scale.square() + 1 - alpha_bar).sqrt()
-
-    def posterior(self, out: Tensor, whitened: Tensor, alpha_bar: Tensor) -> Tensor:
-        """Clean plans ``(batch, horizon, state)``: posterior mean of a Gaussian with this spectrum, plus outputs of the network.
-
-        The outputs are in units of the posterior's standard deviation, the preconditioning of Karras et al. (2022) for each
-        coefficient.
-        """
-        known = alpha_bar.sqrt() * self.scale * whitened + (1 - alpha_bar).sqrt() * out
-        return self(known / self._deviation(alpha_bar))
-
     def forward(self, out: Tensor) -> Tensor:
         """Map outputs (a coefficient per cosine and column) to plans ``(batch, horizon, state)``."""
         return torch.einsum("ct,bcs->bts", self.basis, self.mean + self.scale * out)

@@ -323,6 +323,7 @@ class ConceptModel(Shown, nn.Module, ABC):
         ``frames``, shares ``(sample, place, horizon)`` or ``(1, place, horizon)``, subtract what observed places explain.
         """
         if frames is not None:
+            check_features(observed, {name: self.domain.observed[name] for name in self.config.places})
             states = states - shift(frames, self.config.places, observed, states.shape[2])
         if self.view is not None:
             states = self.view.encode(states, observed)

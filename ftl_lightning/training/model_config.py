@@ -40,7 +40,8 @@ class ModelConfig(Sizes):
         image_encoder: arguments of the image encoders, see :class:`~ftl_lightning.networks.image_encoder.ImageEncoder`.
         feature_dropout: dropout probability of observed vectors by name (0 after normalisation) in training.
         places: columns of the state in the same frame as observed features that plans follow, by feature, in a user's data; see
-            :func:`~ftl_lightning.data.places.places`.
+            :func:`~ftl_lightning.data.places.places`. The network does not observe places: from a few demonstrations, what depends
+            on a place is learned much worse by a network than by a linear regression.
         metrics: metrics of plans for a user's data, see :mod:`ftl_lightning.domains.from_file`.
         training: training options, for the record.
 

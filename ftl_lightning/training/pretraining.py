@@ -175,6 +175,7 @@ class Pretraining(pl.LightningModule, ABC, Generic[M]):
         name, known = self.hparams["view"] or data.view, self._places(data)
         view = find_view(data.domain, name)
         features = data.domain.observed if view is None else view.features
+        features = {name: feature for name, feature in features.items() if name not in known}  # frames see places, networks do not
         observed: Observed
         frames = None
         if known:

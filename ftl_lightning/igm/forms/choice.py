@@ -217,9 +217,10 @@ def _by_skill(learned: Mapping[str, Drawn], references: Mapping[str, Drawn], lef
         learned: samples of learned forms, the simplest first.
     """
     offered = [name for name in NOT_LEARNED if left.setting.places or name != SHIFTED]  # without places this is a copy
-    mixtures = {(form, name): left.mixed(drawn, references[name]) for form, drawn in learned.items() for name in offered}
-    form, name = min(mixtures, key=lambda pair: float(mixtures[pair].mean(dim=1).min()))
-    mixture = mixtures[form, name]  # (share, fold)
+    form = min(learned, key=lambda form: float(learned[form].score.mean()))
+    mixtures = {name: left.mixed(learned[form], references[name]) for name in offered}
+    name = min(mixtures, key=lambda name: float(mixtures[name].mean(dim=1).min()))
+    mixture = mixtures[name]  # (share, fold)
     number = int(mixture.mean(dim=1).argmin())
     alone = [form for form, drawn in learned.items() if _within(drawn.score, mixture[number])]
     if alone:

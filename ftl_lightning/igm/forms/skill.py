@@ -9,7 +9,7 @@ from torch import Tensor
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.energy import PathFeatures, among, apart, ceiling
 from ftl_lightning.data.features import moved
-from ftl_lightning.data.places import first_windows
+from ftl_lightning.data.places import first_windows, frames_of, shift
 from ftl_lightning.data.references import NAMES, SHIFTED, Reference, Setting
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.forms.quality import encoded
@@ -65,8 +65,8 @@ class LeftOut:
         rows: left-out demonstrations ``(fold,)``.
         others: rows of the other demonstrations, for each left-out one.
         frames: frames ``(place, horizon)`` of the others, for each left-out demonstration; ``None`` for a model without places.
-        fresh: score of fresh demonstrations, from the distances among the demonstrations; where places are observed, from those
-            among the demonstrations moved to the places of each.
+        fresh: energy score of fresh demonstrations ``(feature,)``, from the distances among the demonstrations; where places are
+            observed, from those among the demonstrations moved to the places of each.
         setting: what the training concepts say about behaviour, for references.
     """
 
@@ -77,12 +77,26 @@ class LeftOut:
         self.frames = [None if (frames := model.frames_of(part)) is None else frames[0].cpu() for part in self.parts()]
         self.setting = Setting.of(training, model.horizon)
         real = encoded(self.model, first_windows(training, model.horizon), training.initial_states)
-        self.features = PathFeatures(real)
+        self.features = PathFeatures(real, self._within(training))
         known = encoded(self.model, first_windows(demonstrations, model.horizon), demonstrations.initial_states)
         self.truth = known[self.rows]
         some = torch.randperm(len(real), generator=generator("cpu", 0, 8))[: 4 * SAMPLES]
         self.unit = self.features.scores(real[some].expand(len(self.rows), -1, -1, -1), self.truth).mean(dim=0).clamp(min=1e-9)
-        self.fresh = float((self._fresh(known) / self.unit).mean())
+        self.fresh = self._fresh(known) / self.unit
+
+    def _within(self, training: Demonstrations) -> Tensor:
+        """Standard deviation within training concepts ``(horizon, state)``, without what places explain."""
+        paths, horizon = first_windows(training, self.model.horizon), self.model.horizon
+        names = list(dict.fromkeys(training.concepts))
+        rows = torch.tensor([names.index(text) for text in training.concepts])
+        starts = training.initial_states
+        if self.setting.places:
+            shares = frames_of(training, horizon, self.setting.places)[rows]
+            paths = paths - shift(shares, self.setting.places, starts.observed, paths.shape[2])
+        rest = encoded(self.model, paths, starts)
+        means = torch.stack([rest[rows == number].mean(dim=0) for number in range(len(names))])
+        degrees = max(len(rows) - len(names), 1)
+        return ((rest - means[rows]).square().sum(dim=0) / degrees).sqrt()
 
     def _fresh(self, known: Tensor) -> Tensor:
         """Energy score of fresh demonstrations ``(feature,)``."""
@@ -97,7 +111,7 @@ class LeftOut:
 
     def skill(self, score: Tensor | float) -> float:
         """Skill of a mean score."""
-        return (self.fresh + LEAST) / (float(score) + LEAST)
+        return 1 / (float(score) + float((LEAST / (self.fresh + LEAST)).mean()))
 
     def parts(self) -> list[Demonstrations]:
         """The demonstrations without each left-out one, ``(fold,)``."""
@@ -115,9 +129,9 @@ class LeftOut:
         return Drawn(values, self._mean(far), self._mean([among(samples) for samples in values]))
 
     def _mean(self, distances: Sequence[Tensor]) -> Tensor:
-        """Mean over features of distances ``(fold,)``, in units of the score."""
+        """Mean over features of distances ``(fold,)``, each relative to the score of fresh demonstrations."""
         scaled = [distance / unit for distance, unit in zip(distances, self.features.units, strict=True)]
-        return (torch.stack(scaled, dim=1) / self.unit).mean(dim=1)
+        return (torch.stack(scaled, dim=1) / self.unit / (self.fresh + LEAST)).mean(dim=1)
 
     def mixed(self, learned: Drawn, made: Drawn) -> Tensor:
         """Scores ``(share, fold)`` of mixtures in which the :data:`SHARES` of the samples are of ``made``."""

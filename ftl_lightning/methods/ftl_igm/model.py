@@ -54,7 +54,7 @@ def build_denoiser(config: DiffusionConfig) -> nn.Module:
     reason = f"0 for a network that predicts {config.prediction}, which is not smooth"
     require(not (rough and smooth), "denoiser_args.smooth", reason, smooth)
     kind: type[nn.Module] = getattr(networks, config.denoiser)
-    over_time = config.prediction in ("cosines", "remainder") and getattr(kind, "over_time", False)
+    over_time = config.prediction == "cosines" and getattr(kind, "over_time", False)
     require(not over_time, "prediction", f"clean for {config.denoiser}, whose output is smooth by itself", "cosines")
     points = config.denoiser_args.get("initial_encoder") == "points" and config.image_dim
     reads = config.image_encoder.get("head") == "points"
@@ -64,15 +64,9 @@ def build_denoiser(config: DiffusionConfig) -> nn.Module:
         return denoiser
     columns = len(config.state_columns)
     require(columns in (0, config.state_dim), "observed, state", f"{config.state_dim} columns", columns)
-    if config.prediction in ("cosines", "remainder"):
+    if config.prediction == "cosines":
         check_cosines(config.horizon, "model.prediction cosines")
-    spectrum = Spectrum(config.horizon, config.state_dim) if config.prediction in ("cosines", "remainder") else None
-    if config.prediction == "remainder":
-        import os
-
-        if os.environ.get("ZI", "1") == "1":
-            torch.nn.init.zeros_(denoiser.head.weight)
-            torch.nn.init.zeros_(denoiser.head.bias)
+    spectrum = Spectrum(config.horizon, config.state_dim) if config.prediction == "cosines" else None
     return Prediction(denoiser, config.prediction, config.diffusion_steps, config.state_columns, spectrum)
 
 

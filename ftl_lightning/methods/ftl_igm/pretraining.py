@@ -149,16 +149,7 @@ class PretrainingModule(Pretraining[GenerativeModel]):
         else:
             t = timesteps(drawn(count, lambda n: torch.rand(n, generator=draw, device=self.device)), total, power)
         noise = drawn(count, lambda n: torch.randn((n, *clean.shape[1:]), generator=draw, device=self.device))
-        import os
-        P = float(os.environ.get("PW", "0"))
-        metric = None
-        if P and self.hparams["prediction"] == "remainder":
-            spectrum = model.denoiser.spectrum
-            scale = spectrum.scale
-            w = (scale / scale.max()).clamp(min=1e-3) ** (-P / 2)
-            w = w / (w.square() * scale.square()).sum().sqrt() * scale.square().sum().sqrt()
-            metric = lambda e: torch.einsum("ct,bts->bcs", spectrum.basis, e) * w
         losses = denoising_loss(
-            lambda x, t: model.denoiser(x, t, concepts, index, context), clean, noise, t, model.alpha_bar, self.loss.discount, metric
+            lambda x, t: model.denoiser(x, t, concepts, index, context), clean, noise, t, model.alpha_bar, self.loss.discount
         )
         return losses * loss_weights(self.loss.kind, model.alpha_bar)[t]
