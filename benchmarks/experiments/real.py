@@ -99,7 +99,7 @@ def correlation(rows: list[dict[str, Any]]) -> tuple[float, int]:
 
 
 def ahead(rows: list[dict[str, Any]]) -> int:
-    """Standard errors by which the chosen form's score on fresh behaviour is better than the best reference's, paired over cells."""
+    """Standard errors by which the chosen form's score is better than the best reference's, paired over cells."""
     best = min(references.NAMES, key=lambda name: mean(row["score"][name] for row in rows))
     gains = [row["score"][best] - row["score"]["chosen"] for row in rows]
     return round(mean(gains) / max(stdev(gains) / len(gains) ** 0.5, 1e-9)) if len(gains) > 1 else 0

@@ -120,6 +120,9 @@ def explain(concept: str, pretrained: str = "", nearest: int = 3) -> None:
     combination = formula(*alone, names, training)
     if learned.composing is not None or combination:
         say(f"combination of training concepts: {combination or formula(*(learned.composing or alone), names, training)}")
+    if learned.frames is not None:
+        for name, (first, *_, last) in zip(model.config.places, learned.frames.tolist(), strict=True):
+            say(f"plans follow {name!r} by {first:.2f} at the beginning and by {last:.2f} at the end")
     if learned.reference is not None:
         say(f"alone, {learned.share:.0%} of its samples are made without the model ({learned.reference.name}); composed, none are")
     if learned.modes is not None:

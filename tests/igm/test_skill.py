@@ -230,6 +230,7 @@ def test_a_mixture_has_its_share_of_samples_without_the_model(model: FewShot) ->
     assert torch.equal(mixed[:, 0, :2], fresh.observed["start"])
 
 
+@pytest.mark.slow
 def test_plans_are_learned_relative_to_places_and_come_back(tmp_path: Path) -> None:
     demonstrations = concatenate([walks(name, 12) for name in ENDS if name != "between"])
     demonstrations.save(tmp_path / "walks.npz")
