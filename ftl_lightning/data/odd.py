@@ -18,7 +18,7 @@ FEWEST, MOST = 3, 20
 DRAWN, DRAWN_MOVED = 48, 24
 """Sets of training demonstrations that give the limit: without, and with observed places."""
 RIVAL = 2.0
-"""Weight of the distance to the nearest training concept, chosen on the six made sets of benchmarks/experiments/check_real.py."""
+"""Weight of the distance to the nearest training concept, chosen on all sets of benchmarks/experiments/check_real.py."""
 EVEN = 0.2
 """Variance that is added to that within concepts in each number of a feature, relative to the mean variance."""
 

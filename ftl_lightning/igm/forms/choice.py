@@ -167,8 +167,8 @@ def by_skill(
 ) -> Concept:
     """The concept in the form with the highest skill, see :class:`~ftl_lightning.igm.forms.skill.LeftOut`.
 
-    Each learned form is scored alone and in mixtures with samples that need no learning, in the share with the best score. The
-    simplest form whose skill is within one standard error of the best is taken; without a mixture, if that is within one, too.
+    The best learned form is mixed with samples that need no learning, in the share with the best score, which may be 0 or 1. The
+    simplest learned form that is within one standard error of this mixture replaces it.
 
     Args:
         demonstrations: demonstrations of one concept.
@@ -229,12 +229,8 @@ def _by_skill(learned: Mapping[str, Drawn], references: Mapping[str, Drawn], lef
     scores = (mixture[number] if number else learned[form].score, learned[form].score, references[rival].score)
     skills, share = [f"{left.skill(score.mean()):.2f}" for score in scores], round(float(SHARES[number]), 1)
     if share == 1:
-        return (
-            form,
-            name,
-            share,
-            f"no learned form adds to it on left-out demonstrations: skill {skills[0]}, {form} has {skills[1]}",
-        )
+        nothing = f"no learned form adds to it on left-out demonstrations: skill {skills[0]}, {form} has {skills[1]}"
+        return form, name, share, nothing
     said = f"skill {skills[0]} on left-out demonstrations"
     if share:
         said = f"{said}, {skills[1]} without the {share:.0%} of samples that are {name}, not learned"
