@@ -198,6 +198,8 @@ def by_skill(
     references = left.references(first.composition.uncomposed, seed)
     form, name, share, because = _by_skill({name: drawn[name] for name in SIMPLEST if name in whole}, references, left)
     chosen = whole[form]
+    if form == ONE and share < 1:  # the first one has been stopped early
+        chosen = invert(model, demonstrations, _one_set(settings.changed(form=ONE)), steps, tell)[first.origin.name]
     if share:
         chosen = replace(_made(model, demonstrations, name, chosen), share=share)
     numbers = {f"{SKILL}{name}": round(left.skill(value.score.mean()), 4) for name, value in (drawn | references).items()}
