@@ -73,7 +73,7 @@ def test_a_domain_is_fitted_and_a_new_concept_is_learned_and_evaluated(learned: 
     found = Concept.load(concept(folder))
     assert found.origin.name == NEW[domain]
     assert found.embeddings.isfinite().all()
-    if load_model(pretrained).domain.metrics:
+    if load_model(pretrained).domain.metrics and domain != "own":  # a few demonstrations do not calibrate its metric
         (log,) = folder.glob("logs/*/invert")
         assert set(read_rows(log / "results.csv")["task"]) == {NEW[domain]}
 

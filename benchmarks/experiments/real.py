@@ -106,18 +106,17 @@ def ahead(rows: list[dict[str, Any]]) -> int:
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """Means by set, and the forms that were chosen."""
+    """Means by set."""
     lines = [
-        "| set | truth: chosen | warped | Gaussian | adapter | one set | score: chosen | best reference | ahead by | forms |",
-        "|---|---|---|---|---|---|---|---|---|---|",
+        "| set | truth: chosen | warped | Gaussian | adapter | score: chosen | best reference | ahead by |",
+        "|---|---|---|---|---|---|---|---|",
     ]
     for name in dict.fromkeys(str(row["set"]) for row in rows):
         some = [row for row in rows if row["set"] == name]
-        numbers = [mean(row["truth"][form] for row in some) for form in ("chosen", WARPED, GAUSSIAN, ADAPTED, ONE)]
+        numbers = [mean(row["truth"][form] for row in some) for form in ("chosen", WARPED, GAUSSIAN, ADAPTED)]
         scores = [mean(row["score"][form] for row in some) for form in ("chosen", *references.NAMES)]
-        forms = ", ".join(sorted({str(row["form"]) for row in some}))
         shown = [f"{number:.2f}" for number in numbers] + [f"{scores[0]:.3f}", f"{min(scores[1:]):.3f}", f"{ahead(some)} s.e."]
-        lines.append(f"| {name} | {' | '.join(shown)} | {forms} |")
+        lines.append(f"| {name} | {' | '.join(shown)} |")
     value, count = correlation(rows)
     return "\n".join(lines) + f"\n\nRank correlation of skill with truth: {value:.2f}, over {count} forms of {len(rows)} cells.\n"
 

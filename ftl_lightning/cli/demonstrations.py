@@ -162,11 +162,16 @@ def check(options: CheckOptions) -> None:
 def _checked(model: "FewShot | None", demonstrations: "Demonstrations", faults: "tuple[Finding, ...]", learn: bool) -> "Check":
     from ftl_lightning.data.check import check as faults_of
     from ftl_lightning.data.enough import Enough
+    from ftl_lightning.data.kinds import Columns
     from ftl_lightning.training.checks import Check, check_with, faulty
 
     if model is None:
         findings = (*faults, *faults_of(demonstrations))
         sound = not any(finding.severity == "error" for finding in findings)
+        try:
+            Columns(demonstrations.state_kinds)
+        except UserError:  # other concepts of the file contradict the kinds that it declares
+            sound = False
         longest = int(demonstrations.lengths.max())
         enough = Enough.of(demonstrations, longest, without=faulty(findings)) if sound else None
         return Check(demonstrations.concepts[0], demonstrations, findings, enough=enough)

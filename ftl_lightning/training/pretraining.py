@@ -237,8 +237,13 @@ class Pretraining(pl.LightningModule, ABC, Generic[M]):
         self.model.requires_grad_(False).eval()
 
     def _places(self, data: PretrainingData) -> dict[str, tuple[int, ...]]:
-        """Observed places of a user's data that plans follow in linear columns, as long as a plan is a whole demonstration."""
+        """Observed places of a user's data that plans follow in linear columns, as long as a plan is a whole demonstration.
+
+        Beside images there are none: what images show is to be related to places by the network.
+        """
         if not self.framed or data.examples is None or int(data.training.lengths.max()) > data.horizon:
+            return {}
+        if data.training.per_step or any(feature.kind == "image" for feature in data.domain.observed.values()):
             return {}
         kinds = dict(enumerate(data.domain.plans.kinds))
         known = places(data.training, data.horizon)

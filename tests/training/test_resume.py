@@ -102,7 +102,7 @@ def test_options_that_differ_from_the_checkpoint_are_applied_and_told(fit: list[
     ]
     capsys.readouterr()
     succeed(*fit, *FURTHER, *options)
-    (note,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("note: ")]
+    (note,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("note: ckpt_path")]
     expected = "model.learning_rate 0.01 (before: 0.001), model.weight_decay 0.5 (before: 0.01), "
     expected += "model.loss.condition_dropout 0.5 (before: 0.1), data.batch_size 16 (before: 8)"
     assert sorted(note.removeprefix("note: ckpt_path: from step 4 on, ").split(", ")) == sorted(expected.split(", "))
@@ -131,7 +131,7 @@ def test_a_run_that_has_ended_says_so(fit: list[str], capsys: Told) -> None:
     assert "note: ckpt_path: the run had ended at step 4, so nothing was learned" in capsys.readouterr().err
     assert Path("logs/own/fit/pretrained/model.safetensors").read_bytes() == before
     succeed(*fit, *FURTHER)
-    assert "note: " not in capsys.readouterr().err
+    assert "note: ckpt_path" not in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -223,6 +223,8 @@ def _by_skill(learned: Mapping[str, Drawn], references: Mapping[str, Drawn], lef
     mixtures = {name: left.mixed(learned[form], references[name]) for name in offered}
     name = min(mixtures, key=lambda name: float(mixtures[name].mean(dim=1).min()))
     mixture = mixtures[name]  # (share, fold)
+    if any(values.dtype == torch.uint8 for values in left.demonstrations.observed.values()):
+        mixture = mixture[:1]  # references do not see images
     number = int(mixture.mean(dim=1).argmin())
     alone = [form for form, drawn in learned.items() if _within(drawn.score, mixture[number])]
     if alone:
