@@ -42,10 +42,7 @@ class Oddness:
         self.centre = self.columns.encode(training.states).flatten(0, 1).mean(dim=0)
         self.paths, self.seen = first_windows(training, horizon), vectors_of(training)
         self.usual = {name: values.mean(dim=0, keepdim=True) for name, values in self.seen.items()}
-        rows: dict[str, list[int]] = {}
-        for row, text in enumerate(training.concepts):
-            rows.setdefault(text, []).append(row)
-        self.rows = [some for some in rows.values() if len(some) >= FEWEST]
+        self.rows = [rows for rows in training.rows_of.values() if len(rows) >= FEWEST]
         self.features = PathFeatures(self._encoded(self.paths))
         self.frames = [self._frames(self.paths[some], _of(self.seen, some)) for some in self.rows]
         moved = [self._moved(frames, some) for frames, some in zip(self.frames, self.rows, strict=True)]

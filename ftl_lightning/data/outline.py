@@ -45,10 +45,7 @@ class Outline:
         values = self.columns.encode(training.states).flatten(0, 1)
         self.centre, spread = values.mean(dim=0), values.std(dim=0, correction=0)
         self.spread = torch.where(spread > 1e-6 * spread.max(), spread, torch.inf)
-        rows: dict[str, list[int]] = {}
-        for row, text in enumerate(training.concepts):
-            rows.setdefault(text, []).append(row)
-        self.rows = [some for some in rows.values() if len(some) >= FEWEST]
+        self.rows = [rows for rows in training.rows_of.values() if len(rows) >= FEWEST]
         self.limit = cache(self._limit)
 
     def whole(self, paths: Tensor, observed: Observed, demonstrations: Demonstrations) -> Tensor | None:

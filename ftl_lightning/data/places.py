@@ -153,7 +153,6 @@ def shift(shares: Tensor, places: Places, observed: Observed, width: int) -> Ten
 
 def frames_of(demonstrations: Demonstrations, horizon: int, known: Places, prior: Tensor | None = None) -> Tensor:
     """Shares ``(concept, place, horizon)`` of :class:`Frames`, of each concept of the demonstrations, in their order."""
-    paths, observed, texts = first_windows(demonstrations, horizon), vectors_of(demonstrations), demonstrations.concepts
-    rows = [[row for row, text in enumerate(texts) if text == name] for name in dict.fromkeys(texts)]
+    paths, observed, rows = first_windows(demonstrations, horizon), vectors_of(demonstrations), demonstrations.rows_of.values()
     fits = [Frames.fit(paths[some], {key: values[some] for key, values in observed.items()}, known, prior) for some in rows]
     return torch.stack([fit.shares for fit in fits]).float()
