@@ -33,8 +33,9 @@ def several(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
 
 @pytest.fixture
 def page(several: Served, chromium: Browser) -> Browser:
-    """All models, of which strokes is open."""
+    """All models, of which strokes is open, without the demonstrations of the test before: the server keeps them."""
     several.post("/api/open", {"model": "strokes"})
+    several.post("/api/clear", {})
     return opened(chromium, several)
 
 
@@ -56,7 +57,7 @@ def choose(page: Browser, model: str, wait: bool = True) -> None:
 
 
 def front(page: Browser, tab: str) -> None:
-    """Go to a tab. The driver alone leaves the tab in the background, where a click can be lost."""
+    """Bring a tab to the front."""
     page.driver.switch_to.window(tab)
     page.driver.execute_cdp_cmd("Page.bringToFront", {})
     page.until(lambda: page.js("document.visibilityState") == "visible")
