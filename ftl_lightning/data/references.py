@@ -10,9 +10,9 @@ from torch import Tensor
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import Observed
 from ftl_lightning.data.pinned import Pinned
-from ftl_lightning.data.places import Frames, Places, first_windows, places, starts, vectors_of
+from ftl_lightning.data.places import Frames, Places, first_windows, frames_of, places, starts, vectors_of
 from ftl_lightning.services.errors import require, short
-from ftl_lightning.services.validation import from_mapping
+from ftl_lightning.services.validation import check_range, from_mapping
 
 NEAREST, SHIFTED, WARPED, GAUSSIAN = NAMES = (
     "nearest demonstration",
@@ -21,6 +21,8 @@ NEAREST, SHIFTED, WARPED, GAUSSIAN = NAMES = (
     "Gaussian of demonstrations",
 )
 """References by name, see :class:`Reference`."""
+VARIED = "varied demonstrations"
+"""Maker of samples of a learned concept, see :class:`Reference`."""
 SHARE = 0.5
 """Standard deviation of warping, as a share of the standard deviation within training concepts."""
 BEND = 0.4
@@ -37,6 +39,7 @@ class Setting:
         observed_spread: standard deviation of each observed vector ``(size,)`` by name.
         place: standard deviation of a path's mean within concepts ``(state,)``.
         size: standard deviation of the logarithm of a path's size within concepts.
+        frames: shares of the places ``(training concept, place, horizon)``; without places, no place.
     """
 
     places: Places
@@ -44,6 +47,7 @@ class Setting:
     observed_spread: Observed
     place: Tensor
     size: float
+    frames: Tensor
 
     @classmethod
     def of(cls, training: Demonstrations, horizon: int) -> Self:
@@ -58,7 +62,8 @@ class Setting:
             place = torch.stack([some.mean(dim=1).var(dim=0) for some in several]).mean(dim=0).sqrt()
             sizes = torch.stack([_size(some, spread).log().var() for some in several]).mean().sqrt()
         seen = {name: values.std(dim=0, correction=0).clamp(min=1e-9) for name, values in vectors_of(training).items()}
-        return cls(places(training, horizon), starts(training), seen, place, float(sizes))
+        followed = places(training, horizon)
+        return cls(followed, starts(training), seen, place, float(sizes), frames_of(training, horizon, followed))
 
 
 def _size(paths: Tensor, spread: Tensor) -> Tensor:
@@ -73,28 +78,34 @@ class Reference:
     The *nearest demonstration* is the one that observes most alike; without observations, each in turn. The *shifted demonstration*
     is moved by the differences of observed places, with the shares of :class:`~ftl_lightning.data.places.Frames`. *Warped
     demonstrations* also vary in pace, size and place, by :data:`SHARE` of what training concepts vary by. The *Gaussian of
-    demonstrations* has their mean and covariance (a probabilistic movement primitive, Paraschos et al., 2013). Where the initial
-    state is observed, all but the nearest demonstration begin there.
+    demonstrations* has their mean and covariance (a probabilistic movement primitive, Paraschos et al., 2013). *Varied
+    demonstrations* are warped or drawn from the Gaussian, half of each; with places, all from the Gaussian, with the shares of
+    training concepts as prior: a warp would leave the places. Where the initial state is observed, all but the nearest
+    demonstration begin there.
 
     Attributes:
-        name: one of :data:`NAMES`.
+        name: one of :data:`NAMES`, or :data:`VARIED`.
         paths: first windows of the demonstrations ``(demo, horizon, state)``, in the domain's units.
         observed: observed vectors of the demonstrations ``(demo, size)`` by name; images are left out.
         setting: see :class:`Setting`.
+        spread: scale of the deviations of varied demonstrations from their mean, 0 to 1.
     """
 
     name: str
     paths: Tensor
     observed: Observed
     setting: Setting
+    spread: float = 1.0
 
     def __post_init__(self) -> None:
-        require(self.name in NAMES, "form", f"one of {', '.join(NAMES)}", repr(self.name))
+        names = (*NAMES, VARIED)
+        require(self.name in names, "form", f"one of {', '.join(names)}", repr(self.name))
+        check_range("key 'reference.spread'", self.spread, 0, 1)
 
     @classmethod
-    def of(cls, name: str, demonstrations: Demonstrations, setting: Setting, horizon: int) -> Self:
+    def of(cls, name: str, demonstrations: Demonstrations, setting: Setting, horizon: int, spread: float = 1.0) -> Self:
         """Make a reference of demonstrations of one concept."""
-        return cls(name, first_windows(demonstrations, horizon), vectors_of(demonstrations), setting)
+        return cls(name, first_windows(demonstrations, horizon), vectors_of(demonstrations), setting, spread)
 
     def sample(self, observed: Observed, count: int, draw: torch.Generator) -> Tensor:
         """Samples ``(count, horizon, state)`` for observed features ``(count, ...)`` by name; empty for none.
@@ -105,12 +116,18 @@ class Reference:
         index = self._nearest(seen, count)
         if self.name == NEAREST:
             return self.paths[index]
-        frames = Frames.fit(self.paths, self.observed, self.setting.places)
+        prior = self.setting.frames if self.name == VARIED and self.setting.places else None
+        frames = Frames.fit(self.paths, self.observed, self.setting.places, prior)
         width = self.paths.shape[2]
         rest = self.paths - frames.shift(self.observed, width)
         if self.name == WARPED:
-            shift = not frames.places
-            chosen = self._warped(rest[self._each(count, draw)], shift, draw)
+            chosen = self._warped(rest[self._each(count, draw)], not frames.places, draw)
+        elif self.name == VARIED:
+            chosen, mean = _drawn(rest, count, draw), rest.mean(dim=0)
+            if not frames.places:
+                warped = self._warped(rest[self._each(count, draw)], True, draw)
+                chosen = torch.where((torch.randperm(count, generator=draw) % 2 == 0)[:, None, None], warped, chosen)
+            chosen = mean + self.spread * (chosen - mean)
         elif self.name == GAUSSIAN:
             chosen = _drawn(rest, count, draw)
         else:
@@ -165,7 +182,7 @@ class Reference:
 
     def tensors(self) -> dict[str, Tensor]:
         """Tensors of a file, by name."""
-        named = {"paths": self.paths, "place": self.setting.place}
+        named = {"paths": self.paths, "place": self.setting.place, "frames": self.setting.frames}
         named |= {f"observed/{key}": values for key, values in self.observed.items()}
         return named | {f"observed_spread/{key}": values for key, values in self.setting.observed_spread.items()}
 
@@ -173,7 +190,9 @@ class Reference:
     def header(self) -> dict[str, Any]:
         """Header of a file: what is not a tensor."""
         setting = self.setting
-        return {"name": self.name, "places": dict(setting.places), "starts": dict(setting.starts), "size": setting.size}
+        return {"name": self.name, "places": dict(setting.places), "starts": dict(setting.starts), "size": setting.size} | (
+            {"spread": self.spread} if self.name == VARIED else {}
+        )
 
     @classmethod
     def from_file(cls, tensors: Mapping[str, Tensor], header: Any) -> Self:
@@ -183,8 +202,8 @@ class Reference:
             {name.removeprefix(prefix): values for name, values in tensors.items() if name.startswith(prefix)}
             for prefix in ("observed/", "observed_spread/")
         )
-        missing = {"paths", "place"} - set(tensors)
-        require(not missing, "key 'reference'", "paths and place", f"no {', '.join(sorted(missing))}")
+        missing = {"paths", "place", "frames"} - set(tensors)
+        require(not missing, "key 'reference'", "paths, place and frames", f"no {', '.join(sorted(missing))}")
         paths, place = tensors["paths"], "key 'reference'"
         require(paths.dim() == 3 and all(paths.shape), f"{place}: paths", "(demo, horizon, state)", tuple(paths.shape))
         require(
@@ -200,8 +219,11 @@ class Reference:
         for key, columns in known.items():
             fits = key in observed and len(columns) == observed[key].shape[1] and all(0 <= c < paths.shape[2] for c in columns)
             require(fits, f"{place}: places", "columns of the state for each number of an observed feature", short(key))
-        setting = Setting(contents.places, contents.starts, spreads, tensors["place"], contents.size)
-        return cls(contents.name, paths, observed, setting)
+        shape, frames = (len(contents.places), paths.shape[1]), tensors["frames"]
+        fits = frames.dim() == 3 and len(frames) > 0 and frames.shape[1:] == shape
+        require(fits, f"{place}: frames", f"(concept, {shape[0]}, {shape[1]})", tuple(frames.shape))
+        setting = Setting(contents.places, contents.starts, spreads, tensors["place"], contents.size, frames)
+        return cls(contents.name, paths, observed, setting, contents.spread)
 
 
 @dataclass(frozen=True)
@@ -210,6 +232,7 @@ class _Header:
     places: Mapping[str, tuple[int, ...]]
     starts: Mapping[str, tuple[int, ...]]
     size: float
+    spread: float = 1.0
 
 
 def _drawn(paths: Tensor, count: int, draw: torch.Generator) -> Tensor:

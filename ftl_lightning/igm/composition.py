@@ -62,6 +62,8 @@ class Composition(Shown):
         made: maker of samples without the model; ``None`` for samples of the composed denoiser. Compositions of several concepts
             ignore it.
         share: share of the samples that are made by ``made``, 0 to 1.
+        variation: share of the variance within training concepts that is added to samples, 0 to 1: a sample is moved by the root
+            of the share times the deviation of a random example from the mean of its training concept. Sums have the largest.
         space: concept space, see :func:`space_of`; empty if unknown.
 
     Raises:
@@ -78,6 +80,7 @@ class Composition(Shown):
     alone: "Composition | None" = field(default=None, kw_only=True)
     made: Maker | None = field(default=None, kw_only=True)
     share: float = field(default=1.0, kw_only=True)
+    variation: float = field(default=0.0, kw_only=True)
     space: str = field(default="", kw_only=True)
 
     def __post_init__(self) -> None:
@@ -107,6 +110,8 @@ class Composition(Shown):
             yield counted(len(self.adapters), "adapter")
         if self.made is not None:
             yield f"{self.share:.0%} {self.made.name}"
+        if self.variation:
+            yield f"{self.variation:.0%} of the variance of training concepts"
         if self.alone is not None:
             yield "another form where it stands alone"
         yield f"of {self.space or 'any model'}"
@@ -139,6 +144,7 @@ class Composition(Shown):
             frames=None if self.frames is None or other.frames is None else torch.cat((self.frames, other.frames), dim=-3),
             adapters=adapters,
             adapter=torch.cat((self.adapter_number, after), dim=-1) if adapters else None,
+            variation=max(self.variation, other.variation),
             space=self.space or other.space,
         )
 

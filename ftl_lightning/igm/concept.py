@@ -4,7 +4,7 @@ import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -182,6 +182,7 @@ class Concept(Shown):
         reference: maker of the concept's samples without the model, such as a shifted demonstration; ``None`` for samples of the
             model. Composing uses the embeddings.
         share: share of the samples alone that the reference makes, above 0 to 1.
+        variation: share of the variance of training concepts in samples, see :class:`~ftl_lightning.igm.composition.Composition`.
         quality: quality of the samples; ``None`` if not measured. Optional key of the file's header.
         frames: shares of observed places in plans ``(place, horizon)``, see :class:`~ftl_lightning.data.places.Frames`; ``None``
             for a model without places.
@@ -201,10 +202,12 @@ class Concept(Shown):
     reference: Reference | None = None
     frames: Tensor | None = None
     share: float = 1.0
+    variation: float = 0.0
 
     def __post_init__(self) -> None:
         _expect_shapes(self._sets)
         check_range("key 'share'", self.share, 0, 1)
+        check_range("key 'variation'", self.variation, 0, 1)
 
     @property
     def _sets(self) -> dict[str, Tensor]:
@@ -232,6 +235,8 @@ class Concept(Shown):
             yield "an adapter"
         if self.reference is not None:
             yield f"{self.share:.0%} {self.reference.name}"
+        if self.variation:
+            yield f"{self.variation:.0%} of the variance of training concepts"
         yield f"loss {self.origin.loss:.3f}"
         yield f"weights {numbers(self.weights.tolist())}"
         yield f"from {counted(self.origin.count, 'demonstration')}"
@@ -241,7 +246,8 @@ class Concept(Shown):
     def composition(self) -> Composition:
         """The concept as a composition, to sample alone or to compose."""
         space = space_of(self.origin.domain, self.origin.pretrained)
-        plain = Composition(self.embeddings, self.weights, modes=self.modes, frames=self._frames(self.weights), space=space)
+        common: dict[str, Any] = {"variation": self.variation, "space": space}
+        plain = Composition(self.embeddings, self.weights, modes=self.modes, frames=self._frames(self.weights), **common)
         if self.adapter is not None:
             plain = replace(plain, adapters=(self.adapter,), adapter=torch.ones(len(self.weights), dtype=torch.int64))
         if self.reference is not None:
@@ -251,7 +257,7 @@ class Concept(Shown):
             composing = self.embeddings, self.weights
         if composing is None:
             return plain
-        return Composition(*composing, frames=self._frames(composing[1]), alone=plain, space=space)
+        return Composition(*composing, frames=self._frames(composing[1]), alone=plain, **common)
 
     def _frames(self, weights: Tensor) -> Tensor | None:
         """Frames of each component ``(K, place, horizon)``."""
@@ -324,6 +330,7 @@ class Concept(Shown):
             header |= {"quality": asdict(self.quality)}
         if self.adapter is not None and self.adapter.everywhere:
             header |= {"everywhere": True}
+        header |= {"variation": self.variation} if self.variation else {}
         factors = {} if self.adapter is None else self.adapter.tensors()
         tensors = {**self._sets, **{f"{ADAPTER}{name}": factor for name, factor in factors.items()}}
         if self.reference is not None:
@@ -368,7 +375,8 @@ class Concept(Shown):
             quality = from_mapping(QualityRecord, header["quality"], "quality") if header.get("quality") is not None else None
             reference = Reference.from_file(made, header.get("reference")) if made or "reference" in header else None
             share = check_type(header.get("share", 1.0), float, "share")
-            parts = (origin, modes, adapter, choice, composing, quality, reference, tensors.get(FRAMES), share)
+            variation = check_type(header.get("variation", 0.0), float, "variation")
+            parts = (origin, modes, adapter, choice, composing, quality, reference, tensors.get(FRAMES), share, variation)
             concept = cls(tensors["embeddings"], tensors["weights"], *parts)
             if header.get("components", len(concept.weights)) != len(concept.weights):
                 raise UserError(f"key 'components': expected {len(concept.weights)}, found {shown(header['components'])}")

@@ -38,12 +38,14 @@ class Invertible(Protocol):
     frames: Tensor | None
 
     @property
-    def device(self) -> torch.device:
-        """Device of the parameters."""
+    def variations(self) -> Tensor | None:
+        """Normalised deviations of examples from the mean of their concept ``(example, horizon, state)``; ``None`` if unknown."""
 
     @property
-    def hash(self) -> str:
-        """Hash of the pretrained model."""
+    def device(self) -> torch.device: ...
+
+    @property
+    def hash(self) -> str: ...
 
     @property
     def window(self) -> int:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any, Literal, Self
 
-from ftl_lightning.data.references import GAUSSIAN, SHIFTED, WARPED
+from ftl_lightning.data.references import GAUSSIAN, SHIFTED, VARIED, WARPED
 from ftl_lightning.igm.diffusion import LARGEST_POWER, LOSSES
 from ftl_lightning.services.errors import require
 from ftl_lightning.services.validation import LARGEST, LARGEST_RATE, MOST_TOGETHER, check_count, check_factor, check_range, replaced
@@ -21,8 +21,10 @@ paper's form by default); selected by leave-one-out error."""
 ONE, MODES, ADAPTED, MIXED, COMBINED = "one set", "modes", "adapter", "mixtures", "combination"
 """Forms: a set of embeddings; a set for each demonstration, drawn at random; a set and a low-rank adapter of the denoiser; a
 set for each demonstration and a shared adapter, with samples from mixtures; weights of training concepts alone."""
-NOT_LEARNED = (SHIFTED, WARPED, GAUSSIAN)
+NOT_LEARNED = (SHIFTED, WARPED, GAUSSIAN, VARIED)
 """Forms that sample a reference made of the demonstrations, not the model."""
+VARIATION = 0.2
+"""Share of the variance of training concepts that is added to samples of a concept, see ``Composition.variation``."""
 MEAN, CONCEPTS = STARTS = "mean", "concepts"
 """Initial embeddings."""
 FULL, REDUCED = PRECISIONS = "32-true", "bf16-mixed"

@@ -13,9 +13,10 @@ from ftl_lightning.data.demonstrations import Demonstrations, paths_of
 from ftl_lightning.data.enough import Enough
 from ftl_lightning.data.features import moved
 from ftl_lightning.data.odd import Oddness
-from ftl_lightning.igm.concept import Concept
+from ftl_lightning.data.references import NAMES
+from ftl_lightning.igm.concept import KNOWN, Concept
 from ftl_lightning.igm.explanation import formula
-from ftl_lightning.igm.forms.choice import SIMPLEST, combined, learn
+from ftl_lightning.igm.forms.choice import LEARNED, combined, learn
 from ftl_lightning.igm.forms.combination import Combination
 from ftl_lightning.igm.forms.leave_one_out import LeaveOneOut, leave_one_out, odd_one, relative_losses
 from ftl_lightning.igm.settings import AUTO, InversionSettings
@@ -196,8 +197,9 @@ def _best_learned(
     """The learned form with the highest skill, if it is better than every reference, and its skill."""
     (concept,) = learn(model, demonstrations, settings.changed(form=AUTO), steps).values()
     skills = {} if concept.choice is None else concept.choice.skills
-    best = max(skills, key=lambda name: skills[name], default="")
-    return (best, skills[best]) if best in SIMPLEST else None
+    named = [name for name in skills if name in (*LEARNED, *NAMES, KNOWN)]
+    best = max(named, key=lambda name: skills[name], default="")
+    return (best, skills[best]) if best in LEARNED else None
 
 
 def combination_line(model: ConceptModel, demonstrations: Demonstrations, settings: InversionSettings) -> str:

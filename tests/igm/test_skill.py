@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.data.demonstrations import Demonstrations, concatenate
-from ftl_lightning.data.energy import FEATURES, among, apart
+from ftl_lightning.data.energy import among, apart
 from ftl_lightning.data.normalization import Normalization
 from ftl_lightning.data.pinned import Pinned
-from ftl_lightning.data.references import NAMES, SHIFTED, WARPED
+from ftl_lightning.data.places import Places, frames_of
+from ftl_lightning.data.references import NAMES, SHIFTED, VARIED, Reference, Setting
 from ftl_lightning.domains.from_file import own_domain
 from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.few_shot.tuned import ModelSettings
@@ -20,11 +21,10 @@ from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import KNOWN, Concept
 from ftl_lightning.igm.diffusion import cosine_alpha_bar
 from ftl_lightning.igm.explanation import formula
-from ftl_lightning.igm.forms.choice import _by_skill
 from ftl_lightning.igm.forms.combination import Combination
 from ftl_lightning.igm.forms.skill import Drawn, LeftOut
 from ftl_lightning.igm.samplers import SAMPLERS, Sampling
-from ftl_lightning.igm.settings import ADAPTED, COMBINED, NOT_LEARNED, ONE, InversionSettings
+from ftl_lightning.igm.settings import ADAPTED, COMBINED, NOT_LEARNED, ONE, VARIATION, InversionSettings
 from ftl_lightning.methods.ftl_igm.model import DiffusionConfig, GenerativeModel
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.training.model_config import Prepared
@@ -46,6 +46,17 @@ def walks(text: str, count: int, seed: int = 0) -> Demonstrations:
 
 @pytest.fixture(scope="module")
 def model() -> FewShot:
+    """A model whose network observes the start."""
+    return untrained({})
+
+
+@pytest.fixture(scope="module")
+def relative() -> FewShot:
+    """A model of plans relative to the start."""
+    return untrained({"start": (0, 1)})
+
+
+def untrained(places: Places) -> FewShot:
     examples = concatenate([walks(text, 4, seed) for seed, text in enumerate(TEXTS)])
     domain = own_domain(examples, TEXTS, HORIZON, {})
     torch.manual_seed(0)
@@ -58,10 +69,12 @@ def model() -> FewShot:
         encoder="none",
         denoiser_args={"hidden_dim": 16, "depth": 2, "condition_dim": 8},
         diffusion_steps=10,
-        observed=examples.features,
+        observed={} if places else examples.features,
+        places=places,
     )
-    seen = Normalization.fit(examples.observed["start"])
-    prepared = Prepared(config, domain, Normalization.fit(examples.states), torch.randn(4, 6), seen)
+    seen = None if places else Normalization.fit(examples.observed["start"])
+    frames = frames_of(examples, HORIZON, places) if places else None
+    prepared = Prepared(config, domain, Normalization.fit(examples.states), torch.randn(4, 6), seen, frames)
     net = GenerativeModel(prepared)
     net.examples = examples
     settings = ModelSettings(InversionSettings().changed(samples=4), 3, Sampling("dpm_solver", 5, 1.0), 1)
@@ -154,10 +167,10 @@ def test_forms_that_learn_no_embedding_are_kept_sampled_and_composed(model: FewS
 def test_the_form_of_ones_own_data_is_chosen_by_skill_beside_references(model: FewShot) -> None:
     learned = model.learn(walks("between", 4), name="between")
     choice = learned.concept.choice
-    assert set(choice.skills) == {COMBINED, ONE, ADAPTED, KNOWN, *NAMES}
+    assert set(choice.skills) == {COMBINED, ONE, ADAPTED, KNOWN, VARIED, *NAMES}
     assert choice.form in NOT_LEARNED  # an untrained model is no rival
     assert learned.concept.share == 1
-    assert "no learned form adds to it on left-out demonstrations" in choice.because
+    assert "no learned form adds to varied demonstrations on left-out demonstrations" in choice.because
     assert all(0 < skill < 2 for skill in choice.skills.values())
     assert f"{choice.form} has skill {choice.skills[choice.form]:.2f} on left-out demonstrations (without learning: " in str(
         learned.quality
@@ -182,22 +195,46 @@ def test_check_tries_sums_of_training_concepts(model: FewShot) -> None:
     assert "its weights were not learned from (loss " in report
 
 
-def test_without_places_a_shifted_demonstration_is_a_copy_and_is_not_chosen(model: FewShot) -> None:
+def test_samples_vary_as_training_concepts_do_by_the_share_of_their_variance(relative: FewShot) -> None:
+    apart = relative.model.variations
+    assert apart.shape[1:] == (HORIZON, 3)
+    names = relative.model.examples.concepts
+    assert len(apart) == len(names)
+    for name in TEXTS:  # without what the observed start explains, relative to the mean of the concept
+        assert apart[[text == name for text in names]].mean(dim=0).abs().max() < 1e-5
+    fresh = walks("between", 200, seed=5).initial_states
+    plain, varied = (
+        relative.sample(replace(relative["left"], variation=share), observed=fresh.observed, seed=1).states for share in (0.0, 0.2)
+    )
+    assert torch.equal(varied[:, 0, :2], fresh.observed["start"])
+    frames = relative.model.frames[:1].cpu()
+    moved = relative.model.encode(varied, fresh.observed, frames) - relative.model.encode(plain, fresh.observed, frames)
+    added, wanted = moved[:, -1, :2].square().mean(), 0.2 * apart[:, -1, :2].square().mean()
+    assert 0.5 < float(added / wanted) < 2  # the correction at the start reaches a little further
+    half, more = replace(relative["left"], variation=0.1), replace(relative["up"], variation=0.2)
+    assert (more + half).variation == (half + more).variation == 0.2
+    assert (2 * half).variation == 0.1
+
+
+def test_variation_that_does_not_help_is_left_out(relative: FewShot, monkeypatch: pytest.MonkeyPatch) -> None:
+    few = walks("between", 5)
+    assert relative.learn(few, name="between").concept.variation == VARIATION
+    vast = 100 * relative.model.variations
+    monkeypatch.setattr(relative.model, "variations", vast)
+    assert relative.learn(few, name="between").concept.variation == 0
+
+
+def test_varied_demonstrations_are_scaled_about_their_mean(model: FewShot) -> None:
     few = walks("between", 4)
-    left = LeftOut(model.model, few, model.model.examples)
-
-    def drawn(distance: float) -> Drawn:
-        values = [torch.zeros(4, 2, 3) for _ in FEATURES]  # as if no mixture added spread
-        return Drawn(values, torch.full((4,), distance), torch.zeros(4))
-
-    learned = {name: drawn(9.0) for name in (COMBINED, ONE)}
-    references = {name: drawn(5.0) for name in NAMES} | {SHIFTED: drawn(2.0), WARPED: drawn(3.0)}
-    assert _by_skill(learned, references, left)[1:3] == (SHIFTED, 1.0)
-    left.setting = replace(left.setting, places={})
-    assert _by_skill(learned, references, left)[1:3] == (WARPED, 1.0)
-    form, _, share, because = _by_skill({name: drawn(1.0) for name in learned}, references, left)
-    assert (form, share) == (COMBINED, 0)
-    assert "the best reference, the shifted demonstration, has" in because
+    setting = Setting.of(model.model.examples, HORIZON)
+    for known in (setting, replace(setting, places={}, starts={}, frames=setting.frames[:, :0])):
+        wide, narrow = (
+            Reference.of(VARIED, few, known, HORIZON, spread).sample(
+                {"start": torch.zeros(400, 2)}, 400, torch.Generator().manual_seed(0)
+            )
+            for spread in (1.0, 0.5)
+        )
+        torch.testing.assert_close(narrow[:, -1].std(dim=0), wide[:, -1].std(dim=0) / 2)
 
 
 def test_the_share_of_a_mixture_is_that_with_the_best_score(model: FewShot) -> None:

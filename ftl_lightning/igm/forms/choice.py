@@ -8,17 +8,29 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.data.demonstrations import Demonstrations, concatenate
-from ftl_lightning.data.references import SHIFTED, Reference, Setting
+from ftl_lightning.data.references import VARIED, Reference, Setting
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import KNOWN, SKILL, Choice, Concept
 from ftl_lightning.igm.forms.combination import Combination
 from ftl_lightning.igm.forms.leave_one_out import learned_from, quickly, relative_losses
 from ftl_lightning.igm.forms.modes import Modes, even_stretch
 from ftl_lightning.igm.forms.quality import Quality, measured
-from ftl_lightning.igm.forms.skill import SHARES, Drawn, LeftOut
+from ftl_lightning.igm.forms.skill import SHARES, LeftOut
 from ftl_lightning.igm.inversion import Inversion, Tell, Watch, invert
 from ftl_lightning.igm.model import Invertible
-from ftl_lightning.igm.settings import ADAPTED, AUTO, COMBINED, MIXED, MODES, NOT_LEARNED, ONE, PAPER, UNSAID, InversionSettings
+from ftl_lightning.igm.settings import (
+    ADAPTED,
+    AUTO,
+    COMBINED,
+    MIXED,
+    MODES,
+    NOT_LEARNED,
+    ONE,
+    PAPER,
+    UNSAID,
+    VARIATION,
+    InversionSettings,
+)
 from ftl_lightning.services.errors import UserError
 
 RANK, RATE, ADAPTER_STEPS = 1, 3e-3, 120
@@ -26,8 +38,8 @@ RANK, RATE, ADAPTER_STEPS = 1, 3e-3, 120
 SKILLED: Mapping[str, Any] = {"adapter": 8, "adapter_learning_rate": 6e-3, "components": 1, "omega": 1.0, "samples": 16}
 SKILLED_STEPS = 200
 """Settings and steps of the adapter that :func:`by_skill` learns."""
-SIMPLEST = (COMBINED, ONE, ADAPTED)
-"""Learned forms of :func:`by_skill`, the simplest first."""
+LEARNED = (COMBINED, ONE, ADAPTED)
+"""Learned forms of :func:`by_skill`."""
 MODE_SAMPLES, MODE_STEPS = 16, 400
 """Noised demonstrations a step, and maximum number of steps, of modes without an adapter."""
 FOLDS, CLEAR, FEWER = 5, 0.4, 2
@@ -67,7 +79,23 @@ def learn(
     """
     model.check_settings(settings)
     first = invert(model, demonstrations, first_settings(settings), steps, tell, watch, start)
-    if settings.form in (UNSAID, PAPER, ONE):
+    if settings.form in (UNSAID, PAPER):
+        return first
+    variation = 0.0 if model.variations is None else VARIATION
+    if settings.form in NOT_LEARNED:
+        usual = variation if settings.form == VARIED else 0.0
+        return {name: _made(model, demonstrations.select(name), settings.form, concept, usual) for name, concept in first.items()}
+    if settings.form == AUTO and model.examples is not None:
+        return {name: by_skill(model, demonstrations.select(name), settings, steps, first[name], tell) for name in first}
+    concepts = _formed(model, demonstrations, settings, steps, first, tell)
+    return {name: replace(concept, variation=variation) for name, concept in concepts.items()}
+
+
+def _formed(
+    model: Invertible, demonstrations: Demonstrations, settings: InversionSettings, steps: int, first: Concepts, tell: Tell
+) -> Mapping[str, Concept]:
+    """The concepts in the form of the settings, learned from demonstrations; ``first`` are those of one set."""
+    if settings.form == ONE:
         return first
     if settings.form == MODES:
         return _with_modes(model, demonstrations, settings, steps, first, tell)
@@ -76,10 +104,6 @@ def learn(
     if settings.form == COMBINED:
         combinations = {name: Combination.of(model, demonstrations.select(name), settings) for name in first}
         return {name: _combined(model, combinations[name], concept) for name, concept in first.items()}
-    if settings.form in NOT_LEARNED:
-        return {name: _made(model, demonstrations.select(name), settings.form, concept) for name, concept in first.items()}
-    if model.examples is not None:
-        return {name: by_skill(model, demonstrations.select(name), settings, steps, first[name], tell) for name in first}
     return _chosen(model, demonstrations, settings, steps, first, tell)
 
 
@@ -156,10 +180,11 @@ def _combined(model: Invertible, combination: Combination | None, first: Concept
     return Concept(composition.embeddings, composition.weights, origin, frames=first.frames)
 
 
-def _made(model: Invertible, demonstrations: Demonstrations, form: str, first: Concept) -> Concept:
-    """Concept that samples a reference of its demonstrations; ``first`` is composed."""
+def _made(model: Invertible, demonstrations: Demonstrations, form: str, first: Concept, variation: float = 0.0) -> Concept:
+    """Concept that samples a reference of its demonstrations, with a variation; ``first`` is composed."""
     setting = Setting.of(demonstrations if model.examples is None else model.examples, model.horizon)
-    return replace(first, reference=Reference.of(form, demonstrations, setting, model.horizon))
+    reference = Reference.of(form, demonstrations, setting, model.horizon, (1 - variation) ** 0.5)
+    return replace(first, reference=reference, variation=variation)
 
 
 def by_skill(
@@ -167,8 +192,8 @@ def by_skill(
 ) -> Concept:
     """The concept in the form with the highest skill, see :class:`~ftl_lightning.igm.forms.skill.LeftOut`.
 
-    The best learned form is mixed with samples that need no learning, in the share with the best score, which may be 0 or 1. The
-    simplest learned form that is within one standard error of this mixture replaces it.
+    The best learned form is mixed with varied demonstrations, which need no learning, in the share with the best score, which may
+    be 0 or 1. Samples have the variation of training concepts where the score is better with it.
 
     Args:
         demonstrations: demonstrations of one concept.
@@ -178,73 +203,63 @@ def by_skill(
     if len(demonstrations) < 2:
         return replace(first, choice=Choice(ONE, "there is a single demonstration", {}))
     left, seed = LeftOut(model, demonstrations, model.examples), settings.seed
-    whole, drawn = {ONE: first}, dict[str, Drawn]()
+    usual = 0.0 if model.variations is None else VARIATION
+    whole, without = {ONE: first}, dict[str, list[Composition]]()
     combination = Combination.of(model, demonstrations, settings)
+    references = left.references(first.composition.uncomposed, seed)
     if combination is not None:
         assert combination.folds is not None
         whole[COMBINED] = _combined(model, combination, first)
         folds = zip(left.rows, left.frames, strict=True)
-        drawn[COMBINED] = left.drawn([combined(model, combination.folds[row], frames) for row, frames in folds], seed)
+        without[COMBINED] = [combined(model, combination.folds[row], frames) for row, frames in folds]
         alone = torch.zeros_like(combination.weights)
         alone[combination.best] = 1
-        drawn[KNOWN] = left.drawn([combined(model, alone)] * len(left.rows), seed)
+        references[KNOWN] = left.drawn([combined(model, alone)] * len(left.rows), seed)
     parts = left.parts()
     sets = learned_from(model, demonstrations, left.others, quickly(settings), steps, tell)
-    drawn[ONE] = left.drawn([sets.row(fold) for fold in range(len(parts))], seed)
+    without[ONE] = [sets.row(fold) for fold in range(len(parts))]
     labelled = concatenate([replace(part, concepts=(f"{fold}",) * len(part)) for fold, part in enumerate([demonstrations, *parts])])
-    adapted, *without = _adapted(model, labelled, settings.changed(**SKILLED), steps, False, tell, by_sample=True).values()
+    adapted, *others = _adapted(model, labelled, settings.changed(**SKILLED), steps, False, tell, by_sample=True).values()
     whole[ADAPTED] = replace(adapted, origin=replace(first.origin, loss=adapted.origin.loss))
-    drawn[ADAPTED] = left.drawn([concept.composition for concept in without], seed)
-    references = left.references(first.composition.uncomposed, seed)
-    form, name, share, because = _by_skill({name: drawn[name] for name in SIMPLEST if name in whole}, references, left)
-    chosen = whole[form]
+    without[ADAPTED] = [concept.composition for concept in others]
+    drawn = {name: left.drawn(without[name], seed, usual) for name in LEARNED if name in without}
+    form = min(drawn, key=lambda name: float(drawn[name].score.mean()))
+    made = left.made(VARIED, first.composition.uncomposed, seed, usual)
+    mixture = left.mixed(drawn[form], made).mean(dim=1)  # (share,)
+    if any(values.dtype == torch.uint8 for values in demonstrations.observed.values()):
+        mixture = mixture[:1]  # references do not see images
+    number, variation = int(mixture.argmin()), usual
+    if usual:
+        plain = left.drawn(without[form], seed), left.made(VARIED, first.composition.uncomposed, seed)
+        if (score := left.mixed(*plain).mean(dim=1)[number]) < mixture[number]:
+            mixture[number], variation = score, 0.0
+    share, chosen = round(float(SHARES[number]), 1), replace(whole[form], variation=variation)
     if form == ONE and share < 1:  # the first one has been stopped early
         chosen = invert(model, demonstrations, _one_set(settings.changed(form=ONE)), steps, tell)[first.origin.name]
+        chosen = replace(chosen, variation=variation)
     if share:
-        chosen = replace(_made(model, demonstrations, name, chosen), share=share)
-    numbers = {f"{SKILL}{name}": round(left.skill(value.score.mean()), 4) for name, value in (drawn | references).items()}
-    called = form if not share else name if share == 1 else f"{form} and {name}"
-    if 0 < share < 1:
-        score = left.mixed(drawn[form], references[name])[SHARES.tolist().index(share)]
-        numbers[f"{SKILL}{called}"] = round(left.skill(score.mean()), 4)
+        chosen = replace(_made(model, demonstrations, VARIED, chosen, variation), share=share)
+    called = form if not share else VARIED if share == 1 else f"{form} and {VARIED}"
+    skills = {name: left.skill(value.score.mean()) for name, value in (drawn | references | {VARIED: made}).items()}
+    skills[called] = left.skill(mixture[number])
+    numbers = {f"{SKILL}{name}": round(value, 4) for name, value in skills.items()}
+    because = _because(skills, form, called, share, max(references, key=lambda name: skills[name]))
     composing = None if COMBINED not in whole or form == COMBINED else (whole[COMBINED].embeddings, whole[COMBINED].weights)
     keep = composing is not None and float(drawn[COMBINED].score.mean()) <= float(drawn[ONE].score.mean())
     return replace(chosen, choice=Choice(called, because, numbers), composing=composing if keep else None)
 
 
-def _by_skill(learned: Mapping[str, Drawn], references: Mapping[str, Drawn], left: LeftOut) -> tuple[str, str, float, str]:
-    """Learned form, reference, share of the reference in the samples, and reason, by scores on left-out demonstrations.
-
-    Args:
-        learned: samples of learned forms, the simplest first.
-    """
-    offered = [name for name in NOT_LEARNED if left.setting.places or name != SHIFTED]  # without places this is a copy
-    form = min(learned, key=lambda form: float(learned[form].score.mean()))
-    mixtures = {name: left.mixed(learned[form], references[name]) for name in offered}
-    name = min(mixtures, key=lambda name: float(mixtures[name].mean(dim=1).min()))
-    mixture = mixtures[name]  # (share, fold)
-    if any(values.dtype == torch.uint8 for values in left.demonstrations.observed.values()):
-        mixture = mixture[:1]  # references do not see images
-    number = int(mixture.mean(dim=1).argmin())
-    alone = [form for form, drawn in learned.items() if _within(drawn.score, mixture[number])]
-    if alone:
-        form, number = alone[0], 0
-    rival = min(references, key=lambda name: float(references[name].score.mean()))
-    scores = (mixture[number] if number else learned[form].score, learned[form].score, references[rival].score)
-    skills, share = [f"{left.skill(score.mean()):.2f}" for score in scores], round(float(SHARES[number]), 1)
+def _because(skills: Mapping[str, float], form: str, called: str, share: float, rival: str) -> str:
+    """Reason for a form of :func:`by_skill`: its skill, that of its learned part, and that of the best reference."""
+    skill, alone = f"{skills[called]:.2f}", f"{skills[form]:.2f}"
+    beside = f"the best reference, the {rival}, has {skills[rival]:.2f}"
     if share == 1:
-        nothing = f"no learned form adds to it on left-out demonstrations: skill {skills[0]}, {form} has {skills[1]}"
-        return form, name, share, nothing
-    said = f"skill {skills[0]} on left-out demonstrations"
+        nothing = f"no learned form adds to {VARIED} on left-out demonstrations: skill {skill}, {form} has {alone}"
+        return f"{nothing}; {beside}"
+    said = f"skill {skill} on left-out demonstrations"
     if share:
-        said = f"{said}, {skills[1]} without the {share:.0%} of samples that are {name}, not learned"
-    return form, name, share, f"{said}; the best reference, the {rival}, has {skills[2]}"
-
-
-def _within(score: Tensor, best: Tensor) -> bool:
-    """Whether a score ``(fold,)`` is within one standard error of a better one; the error is of the differences."""
-    apart = score - best
-    return float(apart.mean()) <= float(apart.std(correction=1) / len(apart) ** 0.5)
+        said = f"{said}, {alone} without the {share:.0%} of samples that are {VARIED}, not learned"
+    return f"{said}; {beside}"
 
 
 @dataclass(frozen=True)

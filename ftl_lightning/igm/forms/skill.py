@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -117,12 +118,12 @@ class LeftOut:
         """The demonstrations without each left-out one, ``(fold,)``."""
         return [self.demonstrations.rows(rows) for rows in self.others]
 
-    def drawn(self, compositions: Sequence[Composition], seed: int) -> Drawn:
-        """Samples of the compositions ``(fold,)`` that were learned without each left-out demonstration."""
+    def drawn(self, compositions: Sequence[Composition], seed: int, variation: float = 0.0) -> Drawn:
+        """Samples of the compositions ``(fold,)`` that were learned without each left-out demonstration, with a variation."""
         starts = self.demonstrations.initial_states.take(torch.tensor(self.rows).repeat_interleave(SAMPLES))
         draws = [generator("cpu", seed, 9, fold) for fold in range(len(self.rows))]
         sampling = replace(SAMPLING, steps=min(SAMPLING.steps, self.model.max_steps or SAMPLING.steps))
-        together = [composition.to(self.model.device) for composition in compositions]
+        together = [replace(composition, variation=variation).to(self.model.device) for composition in compositions]
         plans = self.model.sample(together, SAMPLES, sampling, draws, moved(starts.observed, self.model.device)).cpu()
         values = [each.unflatten(0, plans.shape[:2]) for each in self.features(encoded(self.model, plans.flatten(0, 1), starts))]
         far = [apart(samples, real) for samples, real in zip(values, self.features(self.truth), strict=True)]
@@ -143,8 +144,9 @@ class LeftOut:
 
     def references(self, like: Composition, seed: int) -> dict[str, Drawn]:
         """Samples of each reference that needs no learning, by name; ``like`` is any composition of the model."""
-        parts, horizon = self.parts(), self.model.horizon
-        return {
-            name: self.drawn([replace(like, made=Reference.of(name, part, self.setting, horizon)) for part in parts], seed)
-            for name in NAMES
-        }
+        return {name: self.made(name, like, seed) for name in NAMES}
+
+    def made(self, name: str, like: Composition, seed: int, variation: float = 0.0) -> Drawn:
+        """Samples of a reference or of varied demonstrations, with a variation; ``like`` as in :meth:`references`."""
+        of = partial(Reference.of, name, setting=self.setting, horizon=self.model.horizon, spread=(1 - variation) ** 0.5)
+        return self.drawn([replace(like, made=of(part)) for part in self.parts()], seed, variation)

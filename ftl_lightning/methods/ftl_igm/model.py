@@ -133,17 +133,25 @@ class GenerativeModel(DiffusionModel, TextConceptModel):
         parts = [composition.uncomposed for composition in compositions]
         if any(part.made is None or part.share < 1 for part in parts):
             plans = self.composed_plans(compositions, count, sampling, generators, self.observe(features), pinned)
-            states = self.decode(plans, features, frames)
+            states = self.decode(self._varied(plans, parts, generators, pinned), features, frames)
         else:
             states = torch.zeros(())
         if any(part.made for part in parts):
             made = self._made(parts, count, generators, features)
-            if pinned is not None:
-                made = self.decode(pinned(self.encode(made, features, frames)), features, frames)
+            if pinned is not None or any(part.variation for part in parts):
+                plans = self._varied(self.encode(made, features, frames), parts, generators, pinned)
+                made = self.decode(plans, features, frames)
             states = torch.where(made.isnan(), states.to(made), made)
         if known is not None:
             states = torch.where(known.isnan(), states, known)
         return states.unflatten(0, shape)
+
+    def _varied(
+        self, plans: Tensor, parts: Sequence[Composition], generators: Sequence[torch.Generator], pinned: Pinned | None
+    ) -> Tensor:
+        """Normalised plans with the variation of the compositions, pinned again."""
+        varied = self.varied(plans, parts, generators)
+        return varied if pinned is None else pinned(varied)
 
     def _made(self, parts: Sequence[Composition], count: int, generators: Sequence[torch.Generator], features: Observed) -> Tensor:
         """Samples ``(composition * count, horizon, state)`` of makers, as kinds of columns allow; NaN for the network."""
