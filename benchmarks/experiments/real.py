@@ -6,7 +6,8 @@ The sets are those of ``real_data.py``. A model of each is pretrained with ``con
 unless it is in ``--models``. Then each new kind is learned from five demonstrations with default settings. The *truth* is the share
 of 100 new samples that are right by the set's rule, or the mean F1 of two classifiers that are trained on 50 samples and tested on
 real behaviour. It is measured for the chosen form and for other forms, two of which need no learning. The *score* is the energy
-score on fresh behaviour, lower is better. A table is written beside the results.
+score on fresh behaviour, lower is better. *Copies*: share of samples that are nearer to one of the five than 95 % of fresh
+behaviour; *diversity* and *roughness* are relative to fresh behaviour. A table is written beside the results.
 """
 
 import argparse
@@ -30,6 +31,7 @@ from ftl_lightning.data.references import GAUSSIAN, WARPED, Reference, Setting
 from ftl_lightning.few_shot.learned_concept import LearnedConcept
 from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.igm.forms.choice import SKILLED, SKILLED_STEPS
+from ftl_lightning.igm.forms.quality import roughness
 from ftl_lightning.igm.settings import ADAPTED, COMBINED, ONE
 
 SHOWN, EACH = 100, 8
@@ -53,6 +55,16 @@ def pretrained(data: RealSet, models: Path) -> FewShot:
         options = ["--trainer.logger.save_dir", str(models), "--trainer.logger.name", name]
         subprocess.run([*command, *options], check=True, stdout=subprocess.DEVNULL)
     return FewShot.from_pretrained(folder)
+
+
+def look(samples: Tensor, five: Tensor, fresh: Tensor, spread: Tensor) -> dict[str, float]:
+    """Copies, diversity and roughness of samples ``(sample, horizon, state)``, by the columns' ``spread``."""
+    samples, five, fresh = samples / spread, five / spread, fresh / spread
+    near = [torch.cdist(paths.flatten(1), five.flatten(1)).amin(dim=1) for paths in (samples, fresh)]
+    wide = [float(paths.var(dim=0).mean().sqrt()) for paths in (samples, fresh)]
+    rough = [float(roughness(paths)) for paths in (samples, fresh)] if samples.shape[1] > 2 else [1.0, 1.0]
+    copies = float((near[0] < near[1].quantile(0.05)).float().mean())
+    return {"copies": round(copies, 4), "diversity": round(wide[0] / wide[1], 4), "roughness": round(rough[0] / rough[1], 4)}
 
 
 def measured(data: RealSet, model: FewShot, kind: str, draw: int) -> dict[str, object]:
@@ -89,7 +101,8 @@ def measured(data: RealSet, model: FewShot, kind: str, draw: int) -> dict[str, o
         samples = data.of(some, {key: values.numpy() for key, values in observed.items()}, kind)
         truth[name] = round(data.right(kind, samples, seed=draw), 4)
     row = {"set": data.name, "kind": kind, "draw": draw, "judge": data.judge, "form": choice.form, "seconds": round(seconds, 1)}
-    return {**row, "truth": truth, "score": scores, "skill": choice.skills}
+    shape = look(plans["chosen"].float(), first_windows(five, horizon).float(), real, features.spread)
+    return {**row, "truth": truth, "score": scores, "look": shape, "skill": choice.skills}
 
 
 def correlation(rows: list[dict[str, Any]]) -> tuple[float, int]:
@@ -108,14 +121,15 @@ def ahead(rows: list[dict[str, Any]]) -> int:
 def table(rows: list[dict[str, Any]]) -> str:
     """Means by set."""
     lines = [
-        "| set | truth: chosen | warped | Gaussian | adapter | score: chosen | best reference | ahead by |",
-        "|---|---|---|---|---|---|---|---|",
+        "| set | truth: chosen | warped | Gaussian | adapter | score: chosen | best reference | ahead by | copies | diversity | roughness |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for name in dict.fromkeys(str(row["set"]) for row in rows):
         some = [row for row in rows if row["set"] == name]
         numbers = [mean(row["truth"][form] for row in some) for form in ("chosen", WARPED, GAUSSIAN, ADAPTED)]
         scores = [mean(row["score"][form] for row in some) for form in ("chosen", *references.NAMES)]
         shown = [f"{number:.2f}" for number in numbers] + [f"{scores[0]:.3f}", f"{min(scores[1:]):.3f}", f"{ahead(some)} s.e."]
+        shown += [f"{mean(row['look'][key] for row in some):.2f}" for key in ("copies", "diversity", "roughness")]
         lines.append(f"| {name} | {' | '.join(shown)} |")
     value, count = correlation(rows)
     return "\n".join(lines) + f"\n\nRank correlation of skill with truth: {value:.2f}, over {count} forms of {len(rows)} cells.\n"

@@ -88,7 +88,7 @@ class Reference:
         paths: first windows of the demonstrations ``(demo, horizon, state)``, in the domain's units.
         observed: observed vectors of the demonstrations ``(demo, size)`` by name; images are left out.
         setting: see :class:`Setting`.
-        spread: scale of the deviations of varied demonstrations from their mean, 0 to 1.
+        spread: scale of the deviations of samples from the mean of the demonstrations, 0 to 1.
     """
 
     name: str
@@ -123,15 +123,17 @@ class Reference:
         if self.name == WARPED:
             chosen = self._warped(rest[self._each(count, draw)], not frames.places, draw)
         elif self.name == VARIED:
-            chosen, mean = _drawn(rest, count, draw), rest.mean(dim=0)
+            chosen = _drawn(rest, count, draw)
             if not frames.places:
                 warped = self._warped(rest[self._each(count, draw)], True, draw)
                 chosen = torch.where((torch.randperm(count, generator=draw) % 2 == 0)[:, None, None], warped, chosen)
-            chosen = mean + self.spread * (chosen - mean)
         elif self.name == GAUSSIAN:
             chosen = _drawn(rest, count, draw)
         else:
             chosen = rest[index]
+        if self.spread < 1:
+            mean = rest.mean(dim=0)
+            chosen = mean + self.spread * (chosen - mean)
         return self._started(chosen + frames.shift(seen, width), seen)
 
     def each(self, observed: Observed) -> Tensor:
@@ -190,9 +192,13 @@ class Reference:
     def header(self) -> dict[str, Any]:
         """Header of a file: what is not a tensor."""
         setting = self.setting
-        return {"name": self.name, "places": dict(setting.places), "starts": dict(setting.starts), "size": setting.size} | (
-            {"spread": self.spread} if self.name == VARIED else {}
-        )
+        return {
+            "name": self.name,
+            "places": dict(setting.places),
+            "starts": dict(setting.starts),
+            "size": setting.size,
+            "spread": self.spread,
+        }
 
     @classmethod
     def from_file(cls, tensors: Mapping[str, Tensor], header: Any) -> Self:

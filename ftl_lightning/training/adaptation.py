@@ -158,13 +158,15 @@ class Adaptation(pl.LightningModule, ABC):
             write_concept(concept, self._files[name], self._quality(name, concept) if self._of_user else None)
 
     def _quality(self, name: str, concept: Concept) -> Inspection | None:
-        """Quality of the samples of a user's concept, also drawn into TensorBoard; ``None`` if it cannot be measured."""
+        """Quality of the samples of a user's concept, or ``None`` if it cannot be measured; TensorBoard has quality and skills."""
         inspection = inspected(self.model, self.domain, self.demonstrations.select(name), concept)
         for logger in self.trainer.loggers if inspection else ():
             if inspection and isinstance(logger, TensorBoardLogger):
                 tag = f"quality/{file_name(name)}"
                 logger.experiment.add_figure(tag, inspection.figure(), self.trainer.global_step)
                 logger.experiment.add_text(tag, str(inspection), self.trainer.global_step)
+                for form, skill in (concept.choice.skills if concept.choice else {}).items():
+                    logger.experiment.add_scalar(f"skill/{file_name(name)}/{form}", skill, self.trainer.global_step)
         return inspection
 
     def on_test_start(self) -> None:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.data.demonstrations import Demonstrations, concatenate
-from ftl_lightning.data.references import VARIED, Reference, Setting
+from ftl_lightning.data.references import VARIED, WARPED, Reference, Setting
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import KNOWN, SKILL, Choice, Concept
 from ftl_lightning.igm.forms.combination import Combination
@@ -192,8 +192,8 @@ def by_skill(
 ) -> Concept:
     """The concept in the form with the highest skill, see :class:`~ftl_lightning.igm.forms.skill.LeftOut`.
 
-    The best learned form is mixed with varied demonstrations, which need no learning, in the share with the best score, which may
-    be 0 or 1. Samples have the variation of training concepts where the score is better with it.
+    The best learned form is mixed with varied or warped demonstrations, which need no learning, in the share with the best score,
+    which may be 0 or 1. Samples have the variation of training concepts where the score is better with it.
 
     Args:
         demonstrations: demonstrations of one concept.
@@ -206,7 +206,8 @@ def by_skill(
     usual = 0.0 if model.variations is None else VARIATION
     whole, without = {ONE: first}, dict[str, list[Composition]]()
     combination = Combination.of(model, demonstrations, settings)
-    references = left.references(first.composition.uncomposed, seed)
+    like = first.composition.uncomposed
+    references = left.references(like, seed)
     if combination is not None:
         assert combination.folds is not None
         whole[COMBINED] = _combined(model, combination, first)
@@ -224,42 +225,40 @@ def by_skill(
     without[ADAPTED] = [concept.composition for concept in others]
     drawn = {name: left.drawn(without[name], seed, usual) for name in LEARNED if name in without}
     form = min(drawn, key=lambda name: float(drawn[name].score.mean()))
-    made = left.made(VARIED, first.composition.uncomposed, seed, usual)
-    mixture = left.mixed(drawn[form], made).mean(dim=1)  # (share,)
-    if any(values.dtype == torch.uint8 for values in demonstrations.observed.values()):
-        mixture = mixture[:1]  # references do not see images
-    number, variation = int(mixture.argmin()), usual
-    if usual:
-        plain = left.drawn(without[form], seed), left.made(VARIED, first.composition.uncomposed, seed)
-        if (score := left.mixed(*plain).mean(dim=1)[number]) < mixture[number]:
-            mixture[number], variation = score, 0.0
-    share, chosen = round(float(SHARES[number]), 1), replace(whole[form], variation=variation)
+    makers = (VARIED,) if left.setting.places else (VARIED, WARPED)  # a warp would leave the places
+    made = {(name, share): left.made(name, like, seed, share) for share in dict.fromkeys((usual, 0.0)) for name in makers}
+    both = {usual: drawn[form], 0.0: left.drawn(without[form], seed) if usual else drawn[form]}
+    images = any(values.dtype == torch.uint8 for values in demonstrations.observed.values())
+    shares = SHARES[:1] if images else SHARES  # makers do not see images
+    mixtures = {key: left.mixed(both[key[1]], each).mean(dim=1)[: len(shares)] for key, each in made.items()}
+    maker, variation = min(mixtures, key=lambda key: float(mixtures[key].min()))
+    mixture = mixtures[maker, variation]
+    share, chosen = round(float(shares[mixture.argmin()]), 1), replace(whole[form], variation=variation)
     if form == ONE and share < 1:  # the first one has been stopped early
         chosen = invert(model, demonstrations, _one_set(settings.changed(form=ONE)), steps, tell)[first.origin.name]
         chosen = replace(chosen, variation=variation)
     if share:
-        chosen = replace(_made(model, demonstrations, VARIED, chosen, variation), share=share)
-    called = form if not share else VARIED if share == 1 else f"{form} and {VARIED}"
-    skills = {name: left.skill(value.score.mean()) for name, value in (drawn | references | {VARIED: made}).items()}
-    skills[called] = left.skill(mixture[number])
+        chosen = replace(_made(model, demonstrations, maker, chosen, variation), share=share)
+    skills = {name: left.skill(value.score.mean()) for name, value in (drawn | references).items()}
+    rival = max(references, key=lambda name: skills[name])
+    beside = f"the best reference, the {rival}, has {skills[rival]:.2f}"
+    varied = maker if not variation or maker == VARIED else f"{maker}, varied"
+    skills[VARIED] = left.skill(made[VARIED, usual].score.mean())
+    called = form if not share else varied if share == 1 else f"{form} and {varied}"
+    skills[called] = left.skill(mixture.min())
     numbers = {f"{SKILL}{name}": round(value, 4) for name, value in skills.items()}
-    because = _because(skills, form, called, share, max(references, key=lambda name: skills[name]))
+    because = f"{_because(skills[called], skills[form], form, varied, share)}; {beside}"
     composing = None if COMBINED not in whole or form == COMBINED else (whole[COMBINED].embeddings, whole[COMBINED].weights)
     keep = composing is not None and float(drawn[COMBINED].score.mean()) <= float(drawn[ONE].score.mean())
     return replace(chosen, choice=Choice(called, because, numbers), composing=composing if keep else None)
 
 
-def _because(skills: Mapping[str, float], form: str, called: str, share: float, rival: str) -> str:
-    """Reason for a form of :func:`by_skill`: its skill, that of its learned part, and that of the best reference."""
-    skill, alone = f"{skills[called]:.2f}", f"{skills[form]:.2f}"
-    beside = f"the best reference, the {rival}, has {skills[rival]:.2f}"
+def _because(skill: float, alone: float, form: str, made: str, share: float) -> str:
+    """Reason for a form of :func:`by_skill`: its skill, and that of the learned ``form`` ``alone``."""
     if share == 1:
-        nothing = f"no learned form adds to {VARIED} on left-out demonstrations: skill {skill}, {form} has {alone}"
-        return f"{nothing}; {beside}"
-    said = f"skill {skill} on left-out demonstrations"
-    if share:
-        said = f"{said}, {alone} without the {share:.0%} of samples that are {VARIED}, not learned"
-    return f"{said}; {beside}"
+        return f"no learned form adds to {made} on left-out demonstrations: skill {skill:.2f}, {form} has {alone:.2f}"
+    said = f"skill {skill:.2f} on left-out demonstrations"
+    return f"{said}, {alone:.2f} without the {share:.0%} of samples that are {made}, not learned" if share else said
 
 
 @dataclass(frozen=True)
