@@ -121,7 +121,8 @@ def ahead(rows: list[dict[str, Any]]) -> int:
 def table(rows: list[dict[str, Any]]) -> str:
     """Means by set."""
     lines = [
-        "| set | truth: chosen | warped | Gaussian | adapter | score: chosen | best reference | ahead by | copies | diversity | roughness |",
+        "| set | truth: chosen | warped | Gaussian | adapter | score: chosen | best reference | ahead by "
+        "| copies | diversity | roughness |",
         "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for name in dict.fromkeys(str(row["set"]) for row in rows):
