@@ -344,7 +344,7 @@ def test_plans_of_ones_own_data_are_judged_by_what_was_shown() -> None:
         net.requires_grad_(False).eval(), ModelSettings(InversionSettings().changed(samples=4), 2, Sampling(steps=5), 1)
     )
     between = walks("between", 1.0)
-    with pytest.raises(UserError, match=r"goal: expected a task of own, such as .*, found 'between'"):
+    with pytest.raises(UserError, match=r"goal: expected a task of own, such as .*, found 'between'; a new concept of your own"):
         model.evaluate(between, "between")
     assert model.evaluate(examples.select("steep"), "steep")["nearest_demonstration"] == 1
     learned = model.learn(between.states, name="between")
