@@ -7,8 +7,8 @@ from functools import partial
 
 import pandas as pd
 
-from ftl_lightning.domains.comparison import OURS, PAPERS_METHOD, Compared, Published
-from ftl_lightning.domains.domain import CLOSED, EXECUTED, Domain
+from ftl_lightning.domains.comparison import CHOSEN, OURS, PAPERS_METHOD, Compared, Published
+from ftl_lightning.domains.domain import CLOSED, EXECUTED, OWN, Domain
 from ftl_lightning.evaluation.generation import LOST, WON
 from ftl_lightning.evaluation.results import LARGEST_WHOLE, METHOD, REFERENCE, labels, latest
 from ftl_lightning.reporting.paired import episodes
@@ -107,7 +107,8 @@ def main_rows(rows: pd.DataFrame, omega: str) -> tuple[pd.DataFrame, str]:
         components, weight = usual if usual in measured else measured.most_common(1)[0][0]
         parts.append(select(setting_rows, K=components, omega=weight))
     selected = rows.loc[rows.index.intersection(pd.concat(parts).index)] if parts else rows
-    is_ours = selected["method"] == OURS
+    # Where the form of own data is chosen, each form has a K and weights of its own.
+    is_ours = (selected["method"] == OURS) & ~((selected["domain"] == OWN) & selected["form"].str.contains(CHOSEN, regex=False))
     weightings = set(_weightings(selected[is_ours]))
     common = usual if usual in weightings or not weightings else next(iter(weightings)) if len(weightings) == 1 else None
     marks = [
