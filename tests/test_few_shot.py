@@ -1,5 +1,6 @@
 """The few-shot learner in Python."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.data.normalization import Normalization
 from ftl_lightning.domains.agent.scenes import OBSERVED
+from ftl_lightning.domains.domain import Metric
 from ftl_lightning.domains.from_file import own_domain
 from ftl_lightning.few_shot.learner import FewShot, LearnedConcept, ModelSettings
 from ftl_lightning.igm.composition import Composition
@@ -27,6 +29,7 @@ from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.randomness import generator
 from ftl_lightning.services.tensor_file import file_hash
 from ftl_lightning.training.model_config import Prepared
+from ftl_lightning.training.quality import judged
 from tests.conftest import CONF, ROOT
 
 NEW = "square diagonal to triangle"
@@ -204,6 +207,13 @@ def test_plans_are_judged_and_drawn_by_a_goal(scenes: FewShot) -> None:
     assert scenes.render(both).get_suptitle() == "samples"
 
 
+def test_plans_to_which_a_metric_does_not_apply_are_left_out_of_its_mean(scenes: FewShot) -> None:
+    plans = scenes.domain.source(None).draw(KNOWN, 4, 0)
+    measures = {"some": [1.0, math.nan, 0.0, math.nan], "none": [math.nan] * 4, "right": [True, True, True, False]}
+    metrics = {name: Metric(lambda goal, states, starts, values=values: torch.tensor(values)) for name, values in measures.items()}
+    assert judged(replace(scenes.domain, metrics=metrics), plans, KNOWN) == {"some": 0.5, "right": 0.75}
+
+
 @pytest.mark.slow
 def test_plans_start_where_they_are_told_to(drives: FewShot) -> None:
     starts = drives.starts("go to bowl", 3, seed=5)
@@ -334,7 +344,7 @@ def test_plans_of_ones_own_data_are_judged_by_what_was_shown() -> None:
         net.requires_grad_(False).eval(), ModelSettings(InversionSettings().changed(samples=4), 2, Sampling(steps=5), 1)
     )
     between = walks("between", 1.0)
-    with pytest.raises(UserError, match=r"goal: expected a task of own, such as .*, found 'between'"):
+    with pytest.raises(UserError, match=r"goal: expected a task of own, such as .*, found 'between'; a new concept of your own"):
         model.evaluate(between, "between")
     assert model.evaluate(examples.select("steep"), "steep")["nearest_demonstration"] == 1
     learned = model.learn(between.states, name="between")

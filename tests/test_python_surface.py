@@ -199,7 +199,7 @@ def test_a_bar_changes_no_plan(things: Things, capsys: pytest.CaptureFixture[str
     other = FewShot.from_pretrained("baseline/cvae/object_rearrangement")  # without a sampler
     one, two = (other.sample(other[SCENE], 5, batch_size=size, progress=True).states for size in (None, 2))
     assert torch.equal(one, two)
-    assert "5 plans: 1 steps" in capsys.readouterr().err
+    assert "5 plans: 1 step, " in capsys.readouterr().err
 
 
 def test_a_sample_with_modes_and_columns_is_drawn_whole() -> None:

@@ -334,7 +334,8 @@ def _constant(demonstrations: Demonstrations) -> Iterator[Finding]:
     varies = states.amax(dim=0) - states.amin(dim=0) > SAME * states.abs().amax(dim=0)
     if len(states) > 1 and varies.any() and not varies.all():
         names = [name for name, changes in zip(demonstrations.state_names, varies.tolist(), strict=True) if not changes]
-        yield Finding(f"{len(names)} of {len(varies)} columns never change ({short(', '.join(names), 50)})", "note")
+        change = "changes" if len(names) == 1 else "change"
+        yield Finding(f"{len(names)} of {len(varies)} columns never {change} ({short(', '.join(names), 50)})", "note")
 
 
 def _duplicates(demonstrations: Demonstrations) -> Iterator[Finding]:

@@ -367,7 +367,9 @@ class Domain(Shown):
         if not self.concepts.reads(goal):
             known = [text for text in self.concepts.descriptions if self.concepts.reads(text)]
             near = difflib.get_close_matches(goal, known, n=5, cutoff=0.4) or known[:5]
-            raise UserError(f"{key}: expected a task of {self.name}, such as {', '.join(map(repr, near))}, found {short(goal)!r}")
+            elsewhere = "; a new concept of your own data is judged where it is learned (invert, FewShot.learn)"
+            found = f"{short(goal)!r}{elsewhere if self.name == OWN else ''}"
+            raise UserError(f"{key}: expected a task of {self.name}, such as {', '.join(map(repr, near))}, found {found}")
 
     @property
     def main_metric(self) -> str:

@@ -44,7 +44,6 @@ from ftl_lightning.domains.recorder import drawn_by_hand
 from ftl_lightning.services.errors import about, note, require, short
 from ftl_lightning.services.randomness import generator, task_key
 from ftl_lightning.services.spectrum import check_cosines
-from ftl_lightning.services.text import counted
 
 CONTINUOUS = "continuous"
 """View of data with columns that are not linear."""
@@ -176,8 +175,8 @@ def uncalibrated(examples: Demonstrations, training: Sequence[str]) -> str:
     fewest = min(counts, key=lambda name: counts[name])
     if counts[fewest] >= CALIBRATED:
         return ""
-    held = f"{short(fewest, 40)!r} has {counted(counts[fewest], 'held-out demonstration')}"
-    return f"{RECOGNISED} is not shown: {held}, {CALIBRATED} of each training concept calibrate it"
+    needed = f"it needs {CALIBRATED} held-out demonstrations of each training concept"
+    return f"{RECOGNISED} is not shown: {needed}, and {short(fewest, 40)!r} has {counts[fewest]}"
 
 
 def _not_measured(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:

@@ -11,7 +11,9 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from ftl_lightning.domains.comparison import CHOSEN
 from ftl_lightning.domains.domain import COVERAGE, NOVELTY
+from ftl_lightning.domains.domain import OWN as OWN_DOMAIN
 from ftl_lightning.evaluation.generation import LOST, OWN, WON, Evaluable, standard_error
 from ftl_lightning.evaluation.results import METHOD, REFERENCE, Row, append_rows, label, public
 from ftl_lightning.services.errors import short
@@ -133,6 +135,8 @@ def _title(rows: Sequence[Row]) -> str:
     if not rows:
         return "nothing was evaluated"
     row = rows[0]
+    if row.domain == OWN_DOMAIN and CHOSEN in row.form:  # each form that may be chosen has a K and weights of its own
+        return f"{row.domain}: {label(row.method, row.form, row.variant)}"
     components = f", K = {row.K}" if row.K else ""
     weight = "" if row.omega == "none" else ", learned weights" if row.omega == "learned" else f", omega {row.omega}"
     return f"{row.domain}: {label(row.method, row.form, row.variant)}{components}{weight}"

@@ -110,7 +110,7 @@ def accuracy_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy
                 span = (place - width / 2, place + (len(learned) + 0.5) * width)
                 _policy_line(axes, index, policy, reference.mean, *span)
     places = [place + width * len(learned) / 2 for place in range(len(shown))]
-    _label_bars(axes, places, shown, metric, f"{domain.name}, {how}")
+    _label_bars(axes, places, shown, metric, f"{domain.name}, {how}" if how else domain.name)
     return figure
 
 

@@ -34,8 +34,8 @@ MOST_DOMAINS, MOST_CELLS = 100, 10_000  #: Maximum number of domains of a report
 
 
 def write_report(results: Path, out: Path, readme: Path | None = None) -> str:
-    """Write Markdown, LaTeX and figures, and return all tables as Markdown. Raise UserError if there are no results, or the
-    Markdown file has no marks.
+    """Write Markdown, LaTeX and figures, and return all tables as Markdown. Raise UserError if there are no results, none that
+    tables show, or the Markdown file has no marks.
 
     Args:
         results: a results file, or a folder of them.
@@ -77,6 +77,8 @@ def write_report(results: Path, out: Path, readme: Path | None = None) -> str:
         everything += [_written(table, out) for table in overview_tables(beside)]
         _save(overview_dots(beside), out / "overview.png")
         headline = [short_overview(beside)]
+    found = ", ".join(sorted(set(select(rows, role=METHOD)["metric"])))
+    require(everything or curve_by_name, str(results), "a metric that tables show", f"{found} alone" if found else "none")
     if readme:
         _splice(readme, "\n".join(table.markdown() for table in headline))
     return "\n".join(table.markdown() for table in everything)

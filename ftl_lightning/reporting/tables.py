@@ -7,8 +7,8 @@ from functools import partial
 
 import pandas as pd
 
-from ftl_lightning.domains.comparison import OURS, PAPERS_METHOD, Compared, Published
-from ftl_lightning.domains.domain import CLOSED, EXECUTED, Domain
+from ftl_lightning.domains.comparison import CHOSEN, OURS, PAPERS_METHOD, Compared, Published
+from ftl_lightning.domains.domain import CLOSED, EXECUTED, OWN, Domain
 from ftl_lightning.evaluation.generation import LOST, WON
 from ftl_lightning.evaluation.results import LARGEST_WHOLE, METHOD, REFERENCE, labels, latest
 from ftl_lightning.reporting.paired import episodes
@@ -84,6 +84,11 @@ def weighting(components: int, omega: str) -> str:
     return f"K = {components}, {weights}" if components else weights
 
 
+def _words(*parts: str) -> str:
+    """Parts of a caption, without those that are empty."""
+    return ", ".join(filter(None, parts))
+
+
 def _weightings(rows: pd.DataFrame) -> list[tuple[int, str]]:
     """K and guidance weight of each row."""
     return list(zip(map(int, rows["K"]), map(str, rows["omega"]), strict=True))
@@ -92,6 +97,7 @@ def _weightings(rows: pd.DataFrame) -> list[tuple[int, str]]:
 def main_rows(rows: pd.DataFrame, omega: str) -> tuple[pd.DataFrame, str]:
     """Rows of a main table, and the words of its caption: for each method and setting two components with the main weight
     ``omega``, or else the most measured weighting, which the column ``mark`` then names. Rows have labels, see :func:`labelled`.
+    The words are empty where no weighting applies: without rows of ours and without a main weight.
     """
     rows = select(rows, role=METHOD)
     usual = (USUAL_K, omega)
@@ -101,13 +107,16 @@ def main_rows(rows: pd.DataFrame, omega: str) -> tuple[pd.DataFrame, str]:
         components, weight = usual if usual in measured else measured.most_common(1)[0][0]
         parts.append(select(setting_rows, K=components, omega=weight))
     selected = rows.loc[rows.index.intersection(pd.concat(parts).index)] if parts else rows
-    is_ours = selected["method"] == OURS
+    # Where the form of own data is chosen, each form has a K and weights of its own.
+    is_ours = (selected["method"] == OURS) & ~((selected["domain"] == OWN) & selected["form"].str.contains(CHOSEN, regex=False))
     weightings = set(_weightings(selected[is_ours]))
     common = usual if usual in weightings or not weightings else next(iter(weightings)) if len(weightings) == 1 else None
     marks = [
         f" ({weighting(*row_weighting)})" if ours and row_weighting != common else ""
         for ours, row_weighting in zip(is_ours, _weightings(selected), strict=True)
     ]
+    if not weightings and not omega:  # neither ours nor a paper's numbers stand here
+        return selected.assign(mark=marks), ""
     return selected.assign(mark=marks), "K and weights in brackets" if common is None else weighting(*common)
 
 
@@ -160,7 +169,7 @@ def _accuracy(domain: Domain, rows: pd.DataFrame, metric: str, name: str) -> lis
                 references.append((first, select(rows, **subject)))
     different = bool(published(domain)) and main_omega(domain) != papers_omega(domain)
     papers_weight = f" (the paper's: {papers_omega(domain)})" if different else ""
-    caption = f"{domain.name}: {metric}, {how}{papers_weight}. Mean ± standard error over tasks (spread over seeds)"
+    caption = f"{_words(f'{domain.name}: {metric}', how)}{papers_weight}. Mean ± standard error over tasks (spread over seeds)"
     return [
         _table(domain, name, caption, ["setting"], subjects),
         _references(domain, name, f"{domain.name}: {metric}", ["setting"], references),
@@ -180,7 +189,7 @@ def _outcomes(domain: Domain, rows: pd.DataFrame) -> list[Table]:
             references.append((first, select(executed, setting=setting, metric=metric)))
     caption, heads = f"{domain.name}: what happened in closed loop", ["setting", "outcome"]
     return [
-        _table(domain, "outcomes", f"{caption}, {how}", heads, subjects),
+        _table(domain, "outcomes", _words(caption, how), heads, subjects),
         _references(domain, "outcomes", caption, heads, references),
     ]
 

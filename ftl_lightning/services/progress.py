@@ -119,7 +119,8 @@ class _Bar:
 
     def end(self) -> None:
         if self.lines:
-            steps = f"{self.done - self.first} steps, " if self.total else ""
+            count = self.done - self.first
+            steps = f"{count} step{'' if count == 1 else 's'}, " if self.total else ""
             say(f"{self.title}: {steps}{self._time()}", error=True)
 
     def _steps(self) -> str:

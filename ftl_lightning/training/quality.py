@@ -51,7 +51,9 @@ def calibration_of(domain: Domain, goal: str, name: str | None = None) -> str:
 
 
 def judged(domain: Domain, plans: Demonstrations, goal: str) -> dict[str, float]:
-    """Evaluate plans by the domain's metrics: success rates or means by name, without metrics that are not measured.
+    """Evaluate plans by the domain's metrics: success rates or means by name, over the plans to which a metric applies.
+
+    Metrics without an applicable plan are omitted.
 
     Raises:
         UserError: for a goal that the domain cannot judge, or a domain without metrics.
@@ -64,10 +66,10 @@ def judged(domain: Domain, plans: Demonstrations, goal: str) -> dict[str, float]
     measured = domain.measure(goal, plans.states, plans.initial_states)
     means = {}
     for name, values in measured.items():
-        if values.isnan().all() and (reason := calibration_of(domain, goal, name)):
+        if not values.isnan().all():
+            means[name] = float(values.double().nanmean())
+        elif reason := calibration_of(domain, goal, name):
             note(reason)
-        else:
-            means[name] = float(values.float().mean())
     return means
 
 

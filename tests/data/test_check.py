@@ -104,7 +104,7 @@ def test_a_stroke_of_another_kind_is_found_by_its_shape() -> None:
 def test_a_length_far_from_the_others_and_columns_or_behaviour_that_never_change_are_told() -> None:
     good = demonstrations(np.concatenate([strokes("wave", 5, 0), np.ones((5, 40, 1))], axis=2))
     (note,) = check(good)
-    assert (note.severity, str(note)) == ("note", "1 of 3 columns never change (2)")
+    assert (note.severity, str(note)) == ("note", "1 of 3 columns never changes (2)")
     short = replace(good, lengths=torch.tensor([40, 40, 9, 40, 40]))
     assert "demonstration 3: has 9 steps, the others 40 to 40" in faults(short)
     placed = torch.randn(5, 1, 3, generator=torch.Generator().manual_seed(0))

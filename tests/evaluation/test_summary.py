@@ -44,6 +44,16 @@ def test_own_concepts_come_first_and_settings_are_means_over_tasks() -> None:
     ]
 
 
+def test_the_title_names_no_weighting_where_the_form_of_own_data_is_chosen() -> None:
+    """Chosen forms of own data have one component or none, whatever ``model.components`` says."""
+    chosen = row("own demonstrations", "my way", "novelty", 0.4, domain="own", form="form chosen")
+    assert plain(summary_table([chosen], ["my way"])).splitlines()[0].strip() == "own: FTL-IGM form chosen (free)"
+    asked = row("own demonstrations", "my way", "novelty", 0.4, domain="own", form="with adapter")
+    assert plain(summary_table([asked], ["my way"])).splitlines()[0].strip().endswith("K = 2, omega 0.6")
+    simulated = row("own demonstrations", "my way", "accuracy", 0.4, form="form chosen")
+    assert plain(summary_table([simulated], ["my way"])).splitlines()[0].strip().endswith("K = 2, omega 0.6")
+
+
 def test_a_task_of_a_suite_may_be_ones_own_too() -> None:
     lines = cells(plain(summary_table(ROWS, ["their way", "b"])))[2:]
     own = ["their way (new)", "b (training)", "- random"]

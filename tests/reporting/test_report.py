@@ -166,6 +166,32 @@ def test_a_domain_without_a_paper_and_its_suites_has_tables_without_the_papers_c
     assert [label.get_text() for label in accuracy_bars(alone, results).axes[0].get_xticklabels()] == ["mine", "new concept"]
 
 
+def test_captions_name_no_weighting_of_a_method_that_has_none_in_a_domain_without_a_paper(tmp_path: Path) -> None:
+    alone = replace(DOMAIN, comparison=replace(DOMAIN.comparison, paper=None))
+    metrics = ("accuracy", "closed loop success")
+    append_rows(tmp_path / "r.csv", [row("mine", "a", 0.5, method="BC", K=0, omega="none", metric=name) for name in metrics])
+    results = read_rows(tmp_path / "r.csv")
+    captions = {table.name: table.caption for table in tables(alone, results)}
+    assert captions["accuracy"].startswith("object_rearrangement: accuracy. Mean ")
+    assert captions["outcomes"] == "object_rearrangement: what happened in closed loop"
+    assert "omega" not in accuracy_bars(alone, results).axes[0].get_title()
+
+
+def test_own_data_have_captions_without_a_weighting_and_no_report_where_no_table_shows_their_metrics(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    own = {"domain": "own", "form": "form chosen"}
+    chosen = [row("own demonstrations", "a", 0.9, metric=name, **own) for name in ("recognised", "novelty")]
+    append_rows(tmp_path / "both.csv", chosen)
+    assert main(["report", f"--results={tmp_path / 'both.csv'}", "--out=both"]) == 0
+    assert (Path("both") / "own" / "accuracy.md").read_text().startswith("**own: recognised. Mean ")
+    capsys.readouterr()
+    append_rows(tmp_path / "novelty.csv", chosen[1:])
+    told = refused(capsys, ["report", f"--results={tmp_path / 'novelty.csv'}", "--out=none"])
+    assert told.endswith("novelty.csv: expected a metric that tables show, found novelty alone\n")
+    assert not Path("none").exists()
+
+
 def test_every_published_number_belongs_to_a_task_or_setting() -> None:
     tasks = {(task.setting, task.name) for suite in DOMAIN.concepts.suites.values() for task in suite.tasks}
     for published in DOMAIN.comparison.paper.numbers:
