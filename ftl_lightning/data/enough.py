@@ -110,11 +110,13 @@ class Enough:
         if self.better is not None:
             said = f"{self.name} has skill {self.better:.2f} on left-out demonstrations (the best reference {curve})"
         else:
-            said = f"{self.name}, which need no learning, have skill {curve} on left-out demonstrations"
+            said = f"skill on left-out demonstrations {curve} ({self.name}, without learning)"
         if self.suffices:
             return f"enough: {without}{said}: these suffice"
         asked = "many more" if self.more is None else f"about {self.more} more"
-        return f"enough: {without}{asked} {'is' if self.more == 1 else 'are'} asked for: {said} ({HIGH} that hardly rises suffices)"
+        return (
+            f"enough: {without}{asked} {'is' if self.more == 1 else 'are'} asked for: {said}; {HIGH} suffices where it hardly rises"
+        )
 
 
 def _wanted(skills: Mapping[int, float], count: int) -> int | None:

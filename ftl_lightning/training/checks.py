@@ -44,10 +44,12 @@ class Known:
     Attributes:
         text: text of the training concept.
         losses: loss of each demonstration ``(demo,)``, relative to the unconditional loss.
+        own: whether the model is of a user's data, where a low loss alone does not tell similar kinds apart.
     """
 
     text: str
     losses: tuple[float, ...]
+    own: bool = False
 
     @property
     def count(self) -> int:
@@ -61,6 +63,8 @@ class Known:
 
     def __str__(self) -> str:
         mean = sum(self.losses) / len(self.losses)
+        if self.own:
+            return f"known: by its loss, {mean:.2f} of the empty concept's, {self.text!r} is the nearest training concept"
         best = f"{self.text!r} ({self.count} of {len(self.losses)}, loss {mean:.2f} of the empty concept's)"
         if self.clear:
             return f"known: the model already explains them as {best}; if that is all you mean, no learning is needed"
@@ -119,7 +123,7 @@ def known_as(
     """The training concept with the lowest mean loss."""
     losses = relative_losses(model, demonstrations, model.compositions(), settings, tell)
     best = int(losses.mean(dim=1).argmin())
-    return Known(model.config.training_concepts[best], tuple(losses[best].tolist()))
+    return Known(model.config.training_concepts[best], tuple(losses[best].tolist()), model.examples is not None)
 
 
 def fit_findings(model: ConceptModel, demonstrations: Demonstrations) -> tuple[Finding, ...]:
