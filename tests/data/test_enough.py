@@ -59,7 +59,7 @@ def test_five_alike_suffice_and_few_that_differ_in_kind_do_not(training: Demonst
         assert hearts is not None
         assert hearts.suffices
         assert hearts.last >= HIGH
-        assert str(hearts).endswith("on left-out demonstrations: these suffice")
+        assert str(hearts).endswith("(Gaussian of demonstrations, without learning): these suffice")
         mixed = Enough.of(concatenate([drawn(kind, 1, 0, "any") for kind in TRAINING[:5]]), horizon, known)  # five kinds
         assert mixed is not None
         assert not mixed.suffices

@@ -193,8 +193,7 @@ def by_skill(
     """The concept in the form with the highest skill, see :class:`~ftl_lightning.igm.forms.skill.LeftOut`.
 
     The best learned form is mixed with varied or warped demonstrations, which need no learning, in the share with the best score,
-    which may be 0 or 1. Samples have the variation of training concepts where the score is better with it. Varied demonstrations
-    alone, which need no choice, are the form if their score is within one standard error of the mixture's.
+    which may be 0 or 1. Samples have the variation of training concepts where the score is better with it.
 
     Args:
         demonstrations: demonstrations of one concept.
@@ -235,8 +234,6 @@ def by_skill(
     maker, variation = min(mixtures, key=lambda key: float(mixtures[key].mean(dim=1).min()))
     mixture = mixtures[maker, variation]
     number = int(mixture.mean(dim=1).argmin())
-    if not images and _within(made[VARIED, usual].score, mixture[number]):
-        maker, variation, mixture, number = VARIED, usual, mixtures[VARIED, usual], len(shares) - 1
     share, chosen = round(float(shares[number]), 1), replace(whole[form], variation=variation)
     if form == ONE and share < 1:  # the first one has been stopped early
         chosen = invert(model, demonstrations, _one_set(settings.changed(form=ONE)), steps, tell)[first.origin.name]
@@ -257,16 +254,10 @@ def by_skill(
     return replace(chosen, choice=Choice(called, because, numbers), composing=composing if keep else None)
 
 
-def _within(score: Tensor, best: Tensor) -> bool:
-    """Whether a score ``(fold,)`` is within one standard error of a better one; the error is of the differences."""
-    apart = score - best
-    return float(apart.mean()) <= float(apart.std(correction=1) / len(apart) ** 0.5)
-
-
 def _because(skill: float, alone: float, form: str, made: str, share: float) -> str:
     """Reason for a form of :func:`by_skill`: its skill, and that of the learned ``form`` ``alone``."""
     if share == 1:
-        return f"no learned form clearly adds to {made} (skill {skill:.2f} on left-out demonstrations, {form} alone {alone:.2f})"
+        return f"no learned form adds to {made} (skill {skill:.2f} on left-out demonstrations, {form} alone {alone:.2f})"
     said = f"skill {skill:.2f} on left-out demonstrations"
     return f"{said}, {alone:.2f} without the {share:.0%} of samples that are {made}, not learned" if share else said
 
