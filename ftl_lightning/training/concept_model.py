@@ -20,7 +20,7 @@ from ftl_lightning.igm.forms.choice import learn
 from ftl_lightning.igm.inversion import Inversion, Tell, Watch
 from ftl_lightning.igm.model import Draws
 from ftl_lightning.igm.samplers import Sampling
-from ftl_lightning.igm.settings import ADAPTED, AUTO, MIXED, MODES, ONE, PAPER, InversionSettings
+from ftl_lightning.igm.settings import ADAPTED, AUTO, MIXED, MODES, NOT_LEARNED, ONE, PAPER, InversionSettings
 from ftl_lightning.networks.image_encoder import ImageEncoders
 from ftl_lightning.services.errors import UserError, require, short, shown
 from ftl_lightning.services.randomness import drawn
@@ -183,7 +183,7 @@ class ConceptModel(Shown, nn.Module, ABC):
         require(free, "model.embeddings.off_span", f"1 (free) for {name}, whose concepts are no texts", off_span)
         constant = "1 for this model, whose concepts do not vary over a plan"
         require(knots == 1 or self.over_time, "model.embeddings.knots", constant, knots)
-        adapted = settings.form in (AUTO, ADAPTED, MIXED)
+        adapted = settings.form in (AUTO, ADAPTED, MIXED, *NOT_LEARNED)
         require(adapts or not adapted, "model.form", f"{PAPER}, {ONE} or {MODES} for {name}", settings.form)
         require(adapts or not settings.adapter.rank, "model.adapter.rank", f"0 (none) for {name}", settings.adapter.rank)
 
