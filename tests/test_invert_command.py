@@ -76,7 +76,7 @@ def test_faults_of_demonstrations_are_noted(model: Path, capfd: pytest.CaptureFi
         (["object_rearrangement", "no.npz"], "no.npz: expected a demonstrations file, found nothing"),
         (["agent", "two.npz"], "two.npz: states: expected behaviour of agent"),
         (["object_rearrangement", "two.npz", "--form=round"], "model.form: expected one of paper, auto"),
-        (["baseline/cvae/object_rearrangement", "two.npz", "--form=warped demonstrations"], "model.form: expected paper, one set or"),
+        (["baseline/cvae/object_rearrangement", "two.npz", "--form=warped demonstrations"], "model.form: expected paper, one set"),
         (["object_rearrangement", "two.npz", "--steps=-1"], "steps: expected 0 or more, found -1"),
         (["object_rearrangement", "two.npz", "--out=two.npz"], "out: two.npz"),
         (["object_rearrangement", "two.npz", "--trainer.max_steps=3"], "trainer.max_steps"),
