@@ -62,8 +62,9 @@ class Composition(Shown):
         made: maker of samples without the model; ``None`` for samples of the composed denoiser. Compositions of several concepts
             ignore it.
         share: share of the samples that are made by ``made``, 0 to 1.
-        variation: share of the variance within training concepts that is added to samples, 0 to 1: a sample is moved by the root
-            of the share times the deviation of a random example from the mean of its training concept. Sums have the largest.
+        variation: share of the variance within training concepts that is added to samples, 0 to 1: a sample is deformed by the
+            root of the share times as much as a random example deviates from the mean of its training concept, see
+            :class:`~ftl_lightning.data.deformation.Deformations`. Sums have the largest.
         space: concept space, see :func:`space_of`; empty if unknown.
 
     Raises:

@@ -6,6 +6,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor, nn
 
+from ftl_lightning.data.deformation import Deformations
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import Observed
 from ftl_lightning.data.pinned import Pinned
@@ -38,8 +39,8 @@ class Invertible(Protocol):
     frames: Tensor | None
 
     @property
-    def variations(self) -> Tensor | None:
-        """Normalised deviations of examples from the mean of their concept ``(example, horizon, state)``; ``None`` if unknown."""
+    def variations(self) -> Deformations | None:
+        """How normalised examples vary within training concepts; ``None`` if unknown."""
 
     @property
     def device(self) -> torch.device: ...
@@ -48,8 +49,7 @@ class Invertible(Protocol):
     def hash(self) -> str: ...
 
     @property
-    def window(self) -> int:
-        """Number of states in a training window."""
+    def window(self) -> int: ...
 
     @property
     def horizon(self) -> int:

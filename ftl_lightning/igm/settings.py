@@ -23,7 +23,7 @@ ONE, MODES, ADAPTED, MIXED, COMBINED = "one set", "modes", "adapter", "mixtures"
 set for each demonstration and a shared adapter, with samples from mixtures; weights of training concepts alone."""
 NOT_LEARNED = (SHIFTED, WARPED, GAUSSIAN, VARIED)
 """Forms that sample a reference made of the demonstrations, not the model."""
-VARIATION = 0.2
+VARIATION = 0.3
 """Share of the variance of training concepts that is added to samples of a concept, see ``Composition.variation``."""
 MEAN, CONCEPTS = STARTS = "mean", "concepts"
 """Initial embeddings."""

@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
+from ftl_lightning.data.deformation import Deformations
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import PINNED, READ, Feature, Observed, check_features, moved
 from ftl_lightning.data.places import Places, first_windows, frames_of, shift, starts
@@ -301,9 +302,9 @@ class ConceptModel(Shown, nn.Module, ABC):
         return frames_of(demonstrations, self.horizon, self.config.places, self.frames.cpu()).to(self.device)
 
     @functools.cached_property
-    def variations(self) -> Tensor | None:
-        """Normalised deviations of examples from the mean of their concept ``(example, horizon, state)``, without what places
-        explain, scaled to the variance within concepts; ``None`` without examples, or for a network that observes something.
+    def variations(self) -> Deformations | None:
+        """How normalised examples vary within training concepts, without what places explain; ``None`` without examples, or for a
+        network that observes something.
         """
         if self.examples is None or self.config.observed:
             return None
@@ -312,20 +313,20 @@ class ConceptModel(Shown, nn.Module, ABC):
         frames = None if self.frames is None else self.frames[rows]
         plans = self.encode(first_windows(self.examples, self.horizon).to(self.device), observed, frames)
         several = [plans[some] for some in (rows == number for number in range(len(names))) if some.sum() > 1]
-        apart = [(some - some.mean(dim=0)) * (len(some) / (len(some) - 1)) ** 0.5 for some in several]
-        return torch.cat(apart) if apart else None
+        return Deformations.fit(several) if several else None
 
     def varied(self, plans: Tensor, parts: Sequence[Composition], generators: Sequence[torch.Generator]) -> Tensor:
         """Add the variation of the compositions to normalised plans ``(composition * count, horizon, state)``."""
-        apart, count = self.variations, len(plans) // max(len(parts), 1)
-        if apart is None or not any(part.variation for part in parts):
+        variations = self.variations
+        if variations is None or not any(part.variation for part in parts):
             return plans
-        moves = torch.zeros_like(plans).unflatten(0, (len(parts), count))
-        for number, (part, draw) in enumerate(zip(parts, generators, strict=True)):
+        varied = []
+        for part, draw, some in zip(parts, generators, plans.chunk(len(parts)), strict=True):
             if part.variation:
-                chosen = torch.randint(len(apart), (count,), generator=draw, device=draw.device)
-                moves[number] = part.variation**0.5 * apart[chosen.to(apart.device)]
-        return plans + moves.flatten(0, 1)
+                chosen = torch.randint(len(variations), (len(some),), generator=draw, device=draw.device).to(some.device)
+                some = some + part.variation**0.5 * variations.of(some, chosen)
+            varied.append(some)
+        return torch.cat(varied)
 
     def points(self) -> list[Point]:
         """Embeddings of the empty concept and the training concepts."""

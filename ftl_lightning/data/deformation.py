@@ -1,0 +1,83 @@
+"""How behaviour of a concept varies: by place, affine shape and pace, which carry to other concepts, and a rest."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import torch
+from torch import Tensor
+
+FULL = 3
+"""Maximum number of columns of a full affine map, with slants and rotations; of more columns each is scaled alone."""
+RIDGE = 1e-3
+"""Ridge penalty of scales and paces, relative to the mean square of what they explain."""
+ROUNDS = 20
+"""Rounds in which shift, affine map and pace are fitted in turn (backfitting)."""
+_LEAST = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class Deformations:
+    """Deviations of examples from the mean of their concept, as deformations of this mean.
+
+    A deviation from the mean path m is ``shift + A (m(t) - mean of m) + sum_j pace_j g_j(t) m'(t) + rest(t)``, where
+    ``g_1 = t (1 - t)`` and ``g_2 = t (1 - t) (2 t - 1)`` keep both ends. Applied to another path, a square gets larger, slanted or
+    slower as circles do, and stays a square.
+
+    Attributes:
+        shift: ``(example, 1, state)``.
+        affine: ``(example, state, state)``, of centred columns.
+        pace: ``(example, 2)``.
+        rest: ``(example, horizon, state)``.
+    """
+
+    shift: Tensor
+    affine: Tensor
+    pace: Tensor
+    rest: Tensor
+
+    @classmethod
+    def fit(cls, concepts: Sequence[Tensor]) -> Self:
+        """Fit to examples ``(example, horizon, state)`` of each concept, two or more; scaled to the variance within concepts."""
+        means = torch.cat([paths.mean(dim=0, keepdim=True).expand_as(paths) for paths in concepts])
+        scales = [torch.full((len(paths), 1, 1), (len(paths) / (len(paths) - 1)) ** 0.5) for paths in concepts]
+        apart = (torch.cat(list(concepts)) - means) * torch.cat(scales).to(means)
+        centred, moves = means - means.mean(dim=1, keepdim=True), _moves(means)
+        slower = torch.zeros_like(apart)
+        for _ in range(ROUNDS):
+            shift = (apart - slower).mean(dim=1, keepdim=True)
+            gram, products = centred.mT @ centred, centred.mT @ (apart - slower)
+            if means.shape[2] > FULL:
+                gram, products = (torch.diag_embed(each.diagonal(dim1=1, dim2=2)) for each in (gram, products))
+            affine = _ridge(gram, products)
+            rest, flat = apart - shift - centred @ affine, moves.flatten(2)  # (example, 2, horizon * state)
+            pace = _ridge(flat @ flat.mT, flat @ rest.flatten(1)[..., None])[..., 0]
+            slower = torch.einsum("ej,ejts->ets", pace, moves)
+        return cls(shift, affine, pace, rest - slower)
+
+    def __len__(self) -> int:
+        return len(self.rest)
+
+    def of(self, paths: Tensor, chosen: Tensor) -> Tensor:
+        """Deviations ``(path, horizon, state)`` of paths by the deformations of examples ``chosen (path,)``."""
+        centred = paths - paths.mean(dim=1, keepdim=True)
+        slower = torch.einsum("pj,pjts->pts", self.pace[chosen], _moves(paths))
+        return self.shift[chosen] + centred @ self.affine[chosen] + slower + self.rest[chosen]
+
+
+def _moves(paths: Tensor) -> Tensor:
+    """Derivatives of paths ``(path, horizon, state)`` by each pace ``(path, 2, horizon, state)``; 0 for fewer than three states."""
+    horizon = paths.shape[1]
+    if horizon < 3:
+        return paths.new_zeros(len(paths), 2, *paths.shape[1:])
+    time = torch.linspace(0, 1, horizon, device=paths.device, dtype=paths.dtype)
+    bends = torch.stack((time * (1 - time), time * (1 - time) * (2 * time - 1)))
+    speed = torch.gradient(paths, dim=1)[0] * (horizon - 1)
+    return bends[:, :, None] * speed[:, None]
+
+
+def _ridge(gram: Tensor, products: Tensor) -> Tensor:
+    """Ridge regressions ``(example, n, k)`` by matrices ``(example, n, n)`` and products ``(example, n, k)``."""
+    size = gram.diagonal(dim1=1, dim2=2).mean(dim=1).clamp(min=_LEAST)
+    eye = torch.eye(gram.shape[1], device=gram.device, dtype=gram.dtype)
+    return torch.linalg.solve(gram + RIDGE * size[:, None, None] * eye, products)
