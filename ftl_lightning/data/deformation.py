@@ -37,11 +37,17 @@ class Deformations:
     rest: Tensor
 
     @classmethod
-    def fit(cls, concepts: Sequence[Tensor]) -> Self:
-        """Fit to examples ``(example, horizon, state)`` of each concept, two or more; scaled to the variance within concepts."""
+    def fit(cls, concepts: Sequence[Tensor], deform: bool = True) -> Self:
+        """Fit to examples ``(example, horizon, state)`` of each concept, two or more; scaled to the variance within concepts.
+
+        Without ``deform`` all of a deviation is rest: where paths follow places, a deformed one would leave them.
+        """
         means = torch.cat([paths.mean(dim=0, keepdim=True).expand_as(paths) for paths in concepts])
         scales = [torch.full((len(paths), 1, 1), (len(paths) / (len(paths) - 1)) ** 0.5) for paths in concepts]
         apart = (torch.cat(list(concepts)) - means) * torch.cat(scales).to(means)
+        if not deform:
+            count, _, state = apart.shape
+            return cls(apart.new_zeros(count, 1, state), apart.new_zeros(count, state, state), apart.new_zeros(count, 2), apart)
         centred, moves = means - means.mean(dim=1, keepdim=True), _moves(means)
         slower = torch.zeros_like(apart)
         for _ in range(ROUNDS):

@@ -313,7 +313,7 @@ class ConceptModel(Shown, nn.Module, ABC):
         frames = None if self.frames is None else self.frames[rows]
         plans = self.encode(first_windows(self.examples, self.horizon).to(self.device), observed, frames)
         several = [plans[some] for some in (rows == number for number in range(len(names))) if some.sum() > 1]
-        return Deformations.fit(several) if several else None
+        return Deformations.fit(several, deform=self.frames is None) if several else None
 
     def varied(self, plans: Tensor, parts: Sequence[Composition], generators: Sequence[torch.Generator]) -> Tensor:
         """Add the variation of the compositions to normalised plans ``(composition * count, horizon, state)``."""

@@ -51,3 +51,10 @@ def test_examples_of_a_single_state_or_of_many_columns_vary_by_shifts_and_scales
     wide = Deformations.fit([torch.randn(6, 20, 12, generator=draw)])
     off = wide.affine - torch.diag_embed(wide.affine.diagonal(dim1=1, dim2=2))
     assert float(off.abs().max()) == 0
+
+
+def test_where_paths_follow_places_deviations_are_added_as_they_are() -> None:
+    paths = circles(4)
+    found = Deformations.fit([paths], deform=False)
+    added = found.of(LINE.expand(4, -1, -1), torch.arange(4))
+    torch.testing.assert_close(added, (paths - paths.mean(dim=0)) * (4 / 3) ** 0.5)
