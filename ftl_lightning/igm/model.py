@@ -29,6 +29,7 @@ class Invertible(Protocol):
     """Frozen model through which concepts are learned; see :class:`~ftl_lightning.training.concept_model.ConceptModel`.
 
     Attributes:
+        device, hash, window: device of the parameters, hash of the pretrained model, number of states in a training window.
         training_embeddings: embeddings of the training concepts ``(training concept, n)``, centred: their mean is 0.
         examples: demonstrations of training concepts, for a user's data; else ``None``.
         frames: shares of observed places in plans ``(training concept, place, horizon)``; ``None`` for a model without places.

@@ -226,7 +226,11 @@ def by_skill(
     drawn = {name: left.drawn(without[name], seed, usual) for name in LEARNED if name in without}
     form = min(drawn, key=lambda name: float(drawn[name].score.mean()))
     makers = (VARIED,) if left.setting.places else (VARIED, WARPED)  # a warp would leave the places
-    made = {(name, share): left.made(name, like, seed, share) for share in dict.fromkeys((usual, 0.0)) for name in makers}
+    made = {
+        (name, share): references[name] if name in references and not share else left.made(name, like, seed, share)
+        for share in dict.fromkeys((usual, 0.0))
+        for name in makers
+    }
     both = {usual: drawn[form], 0.0: left.drawn(without[form], seed) if usual else drawn[form]}
     images = any(values.dtype == torch.uint8 for values in demonstrations.observed.values())
     shares = SHARES[:1] if images else SHARES  # makers do not see images
