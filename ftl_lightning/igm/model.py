@@ -137,8 +137,7 @@ class DiffusionModel(nn.Module):
     def draws(self, samples: int, timestep_power: float, draw: torch.Generator) -> Draws:
         """Draw noise and timesteps, see :func:`~ftl_lightning.igm.diffusion.timesteps`.
 
-        The timesteps are stratified: one u in each of ``samples`` equal parts of [0, 1), in random order. This lowers the variance
-        of the mean loss.
+        Timesteps are stratified, which lowers the variance of the mean loss: one u in each of ``samples`` equal parts of [0, 1).
         """
         device = draw.device
         u = (torch.arange(samples, device=device) + torch.rand(samples, generator=draw, device=device)) / samples
