@@ -74,14 +74,7 @@ def aligned(demonstrations: Demonstrations, names: Sequence[str], units: Sequenc
         require(not missing and not foreign and len(set(given)) == len(given), "key 'state_names'", wanted, found)
         order = [given.index(name) for name in expected]
         note(f"columns {short(', '.join(given), 80)} are put in the model's order {short(', '.join(expected), 80)}")
-        kinds = tuple(demonstrations.state_kinds[column] for column in order) if demonstrations.state_kinds else ()
-        demonstrations = replace(
-            demonstrations,
-            states=demonstrations.states[..., order],
-            state_names=expected,
-            state_units=tuple(demonstrations.state_units[column] for column in order),
-            state_kinds=kinds,
-        )
+        demonstrations = demonstrations.columns(order)
     factors = [_factor(name, *pair) for name, *pair in zip(expected, demonstrations.state_units, units, strict=True)]
     if any(factor != 1 for factor in factors):
         changed = ", ".join(

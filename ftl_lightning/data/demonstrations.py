@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ftl_lightning.data.actions import held_actions, named_actions
 from ftl_lightning.data.features import Feature, InitialStates, Observed, check_whole, precise, take
 from ftl_lightning.data.kinds import KINDS, Paths
 from ftl_lightning.services.errors import UserError, about, require, short
@@ -39,6 +40,8 @@ class Contents(TypedDict):
     scenes: Tensor | None
     provenance: Mapping[str, Any]
     state_kinds: tuple[str, ...]
+    actions: Tensor | None
+    action_names: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -118,6 +121,8 @@ class Demonstrations(Shown):
         scenes: ``(demo, scene)`` float32, which reset the environment to each demonstration's initial state and serve a judge,
             never a model; ``None`` if there are none.
         provenance: origin of the demonstrations (generator, seed, ...), anything JSON can hold.
+        actions: ``(demo, time, action)`` float32, what was done in the state of the same time; ``None`` if unknown. Padded.
+        action_names: an entry for each action; empty for numbers.
 
     Raises:
         UserError: at construction, for other shapes or values.
@@ -134,6 +139,8 @@ class Demonstrations(Shown):
     scenes: Tensor | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
     state_kinds: tuple[str, ...] = ()
+    actions: Tensor | None = None
+    action_names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         size = tuple(self.states.shape)
@@ -162,18 +169,27 @@ class Demonstrations(Shown):
             shape = tuple(self.scenes.shape)
             require(len(shape) == 2 and shape[0] == count, "key 'scenes'", f"shape ({count}, scene)", str(shape))
             require(self.scenes.dtype == torch.float32, "key 'scenes'", "float32", str(self.scenes.dtype))
+        if self.actions is not None:
+            shape, wanted = tuple(self.actions.shape), f"float32 of shape ({count}, {time}, action), or a time less"
+            fits = self.actions.dtype == torch.float32 and len(shape) == 3 and shape[:2] == (count, time) and shape[2] > 0
+            require(fits, "key 'actions'", wanted, f"{self.actions.dtype} {shape}")
+            names = len(self.action_names)
+            require(names in (0, shape[2]), "key 'action_names'", f"{shape[2]} entries", names)
         for key, tensor in self.tensors.items():
             if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
                 where = (~torch.isfinite(tensor)).nonzero()[0].tolist()
                 raise UserError(f"key {key!r}: expected finite numbers, found {tensor[tuple(where)].item()} at index {where}")
 
     @classmethod
-    def of(cls, states: Sequence[Any], concepts: str | Sequence[str] = "", **attributes: Any) -> Self:
+    def of(
+        cls, states: Sequence[Any], concepts: str | Sequence[str] = "", actions: Sequence[Any] | None = None, **attributes: Any
+    ) -> Self:
         """Demonstrations of any lengths from a list of arrays: ``Demonstrations.of(paths, "heart").save("five.npz")``.
 
         Args:
             states: an array ``(time, state)`` for each demonstration.
             concepts: a text for each demonstration, or a single text for all.
+            actions: an array ``(time, action)`` or ``(time - 1, action)`` for each demonstration; ``None`` if unknown.
             attributes: further attributes of the class.
 
         Raises:
@@ -185,6 +201,8 @@ class Demonstrations(Shown):
         unnamed = {"domain": "", "state_names": tuple(map(str, range(columns))), "state_units": ("",) * columns}
         texts = (concepts,) * count if isinstance(concepts, str) else tuple(concepts)
         numbers = torch.from_numpy(precise(whole.numpy()))
+        if actions is not None:
+            attributes = {**attributes, "actions": held_actions(stacked(actions)[0].float(), lengths, whole.shape[1])}
         return cls(**{"states": numbers, "lengths": lengths, "concepts": texts, **unnamed, **attributes})
 
     def __len__(self) -> int:
@@ -209,7 +227,8 @@ class Demonstrations(Shown):
         """All tensors, by their keys in a file."""
         scenes = {} if self.scenes is None else {"scenes": self.scenes}
         features = {OBSERVED + name: values for name, values in self.observed.items()}
-        return {"states": self.states, "lengths": self.lengths} | features | scenes
+        actions = {} if self.actions is None else {"actions": self.actions}
+        return {"states": self.states, "lengths": self.lengths} | features | scenes | actions
 
     @property
     def features(self) -> dict[str, Feature]:
@@ -224,6 +243,32 @@ class Demonstrations(Shown):
             rows.setdefault(text, []).append(row)
         return rows
 
+    @property
+    def joined(self) -> Self:
+        """Demonstrations whose actions, if there are any, are the last columns of the states."""
+        if self.actions is None:
+            return self
+        size = self.actions.shape[2]
+        return replace(
+            self,
+            states=torch.cat((self.states, self.actions.to(self.states.dtype)), dim=2),
+            state_names=(*self.state_names, *named_actions(self.action_names or tuple(map(str, range(size))))),
+            state_units=(*self.state_units, *("",) * size),
+            state_kinds=(*self.state_kinds, *(KINDS[0],) * size) if self.state_kinds else (),
+            actions=None,
+            action_names=(),
+        )
+
+    def columns(self, chosen: Sequence[int]) -> Self:
+        """Select columns of the states by their numbers from 0, in this order."""
+        return replace(
+            self,
+            states=self.states[..., list(chosen)],
+            state_names=tuple(self.state_names[column] for column in chosen),
+            state_units=tuple(self.state_units[column] for column in chosen),
+            state_kinds=tuple(self.state_kinds[column] for column in chosen) if self.state_kinds else (),
+        )
+
     def select(self, concept: str) -> Self:
         """Select the demonstrations of a concept."""
         return self.rows([index for index, text in enumerate(self.concepts) if text == concept])
@@ -237,6 +282,7 @@ class Demonstrations(Shown):
             concepts=tuple(self.concepts[row] for row in chosen),
             observed=take(self.observed, chosen),
             scenes=None if self.scenes is None else self.scenes[chosen],
+            actions=None if self.actions is None else self.actions[chosen],
         )
 
     def starts(self, rows: Tensor, share: Tensor, exponent: float, horizon: int, at_rest: bool = True) -> Tensor:

@@ -89,7 +89,7 @@ def _is_vector(space: gymnasium.Space[Any]) -> bool:
 class Recorder(gymnasium.Wrapper[Any, Any, Any, Any]):
     """Record every episode of an environment as a demonstration, whoever acts in it: a person, a script or a policy.
 
-    An episode of n steps has n + 1 states. It ends when the environment terminates or truncates it; later steps are not recorded.
+    An episode of n steps has n + 1 states; the last action, if actions are vectors, is repeated in the last state. It ends when the environment terminates or truncates it; later steps are not recorded.
     The wrapper does not change the environment's behaviour.
 
     Args:
@@ -134,6 +134,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._keep_unfinished, self.concept, self.dropped = keep_unfinished, concept, 0
         self._done: list[Episode] = []
         self._running: list[dict[str, NDArray[Any]]] = []
+        self._actions: list[NDArray[Any]] = []
         self._shapes: dict[str, tuple[int, ...]] = {}
         self._text = concept
 
@@ -143,12 +144,14 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any]):
         kept = self._unfinished()
         self._done += kept
         self.dropped += bool(self._running) and not kept
-        self._text, self._running = self.concept, []
+        self._text, self._running, self._actions = self.concept, [], []
         self._record(observation)
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Step the environment and record the observation."""
+        """Step the environment and record action and observation."""
+        if self._running and _is_vector(self.action_space):
+            self._actions.append(_numbers(action).reshape(-1))
         observation, reward, terminated, truncated, info = super().step(action)
         if self._running:
             self._record(observation)
@@ -184,7 +187,8 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def _episode(self) -> Episode:
         states, *features = (np.stack([values[name] for values in self._running]) for name in self._shapes)
-        return Episode(states, dict(zip(self._observed, features, strict=True)), self._text)
+        actions = np.stack(self._actions) if self._actions else None
+        return Episode(states, dict(zip(self._observed, features, strict=True)), self._text, actions=actions)
 
     def _unfinished(self) -> list[Episode]:
         """The running episode, if it is to be kept."""

@@ -231,7 +231,7 @@ def read_own(path: str) -> Demonstrations:
     Raises:
         UserError: naming the file, if it is missing or damaged.
     """
-    read = Demonstrations.load(path).named(Path(path).stem)
+    read = Demonstrations.load(path).named(Path(path).stem).joined
     return replace(read, states=held(read.states, read.lengths, continues=0))
 
 

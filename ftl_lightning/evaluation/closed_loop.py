@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ftl_lightning.data.features import InitialStates, Observed, moved, take
@@ -26,6 +27,8 @@ Planner = Callable[[Tensor, int, Observed], Tensor]
 """``(plans (episode, horizon, state), age in steps, observed) -> actions (episode, action)``."""
 MakePlans = Callable[[Observed, list[int]], Tensor]
 """``(observed (episode, *shape) by name, episode numbers) -> plans (episode, horizon, state)``."""
+Seen = Callable[[int, int, Any, float, Mapping[str, Any]], None]
+"""``(episode, step, observation, reward, info)``; step 0 is the reset."""
 SIDE_BY_SIDE = 64
 """Number of parallel episodes: a simulator takes tens of megabytes, and a larger batch plans no faster."""
 
@@ -49,7 +52,7 @@ def roll_out(loop: ClosedLoop, starts: InitialStates, policy: Policy) -> Rollout
     rollout = Rollout(starts, observed, torch.zeros(count, dtype=torch.bool), [{} for _ in range(count)])
     with bar(f"{count} episodes", loop.steps * count, lines=False) as advance:
         for first in range(0, count, SIDE_BY_SIDE):
-            _lock_step(loop, range(first, min(first + SIDE_BY_SIDE, count)), rollout, policy, advance)
+            _episodes(loop, range(first, min(first + SIDE_BY_SIDE, count)), rollout, policy, advance)
     return rollout
 
 
@@ -70,18 +73,14 @@ def _reset(environment: "gymnasium.Env[Any, Any]", row: int, scene: Tensor) -> A
         return environment.reset(options={"scene": scene.numpy()})[0]
 
 
-def _lock_step(loop: ClosedLoop, rows: range, rollout: Rollout, policy: Policy, advance: Advance) -> None:
-    """Run consecutive episodes in lockstep and fill in the rollout."""
+def _episodes(loop: ClosedLoop, rows: range, rollout: Rollout, policy: Policy, advance: Advance) -> None:
+    """Run consecutive episodes of a domain's environment in lockstep and fill in the rollout."""
     scenes = rollout.starts.require_scenes()
     # Current values of all features; the rollout keeps some of them.
     current = {name: values[rows.start : rows.stop].clone() for name, values in rollout.starts.observed.items()}
-    environments: dict[int, gymnasium.Env[Any, Any]] = {}
 
-    def fail(row: int, reason: str) -> None:
-        rollout.failed[row] = True
-        _LOG.warning("episode %d, %s; the episode counts as failed", row, reason)
-
-    def observe(row: int, step: int, observation: Any) -> None:
+    def seen(row: int, step: int, observation: Any, reward: float, info: Mapping[str, Any]) -> None:
+        rollout.infos[row].update(info)
         for name, values in current.items():
             value = observation.get(name) if isinstance(observation, Mapping) else None
             shape, place = tuple(values.shape[1:]), row - rows.start
@@ -92,44 +91,80 @@ def _lock_step(loop: ClosedLoop, rows: range, rollout: Rollout, policy: Policy, 
             if name in rollout.observed:
                 rollout.observed[name][row, step:] = values[place]
 
+    def act(active: list[int], step: int) -> NDArray[np.float32]:
+        return policy(take(current, [row - rows.start for row in active]), active, step).numpy().astype(np.float32)
+
+    def failed(row: int) -> None:
+        rollout.failed[row] = True
+
     with ExitStack() as stack:
-        for row in rows:
-            environment = stack.enter_context(closing(loop.environment()))
-            try:
-                observation = _reset(environment, row, scenes[row])
-            except (UserError, MemoryError, OSError):
-                raise
-            except Exception as error:  # any error of a simulator: the other episodes go on
-                fail(row, f"before its first step: {error!r}")
-                advance(loop.steps)
+        environments = {row: stack.enter_context(closing(loop.environment())) for row in rows}
+        lock_step(environments, lambda row: _reset(environments[row], row, scenes[row]), act, loop.steps, seen, failed, advance)
+
+
+def lock_step(
+    environments: "Mapping[int, gymnasium.Env[Any, Any]]",
+    reset: Callable[[int], Any],
+    act: Callable[[list[int], int], NDArray[np.float32]],
+    steps: int,
+    seen: Seen,
+    failed: Callable[[int], None],
+    advance: Advance,
+) -> None:
+    """Run episodes in lockstep, each until its environment ends it. An error of an environment only fails its episode.
+
+    Args:
+        environments: environment of each episode.
+        reset: ``episode -> first observation``.
+        act: ``(active episodes, step) -> actions (episode, action)``; not finite for no action, which fails the episode.
+        steps: maximum number of steps.
+        seen: called after a reset and after each step.
+        failed: called for an episode that fails.
+        advance: called with numbers of steps.
+
+    Raises:
+        UserError, MemoryError, OSError: from an environment.
+    """
+    active: list[int] = []
+
+    def fail(row: int, reason: str) -> None:
+        failed(row)
+        _LOG.warning("episode %d, %s; the episode counts as failed", row, reason)
+
+    for row in environments:
+        try:
+            observation = reset(row)
+        except (UserError, MemoryError, OSError):
+            raise
+        except Exception as error:  # any error of a simulator: the other episodes go on
+            fail(row, f"before its first step: {error!r}")
+            advance(steps)
+            continue
+        seen(row, 0, observation, 0.0, {})
+        active.append(row)
+    for step in range(steps):
+        if not active:
+            break
+        actions = act(active, step)
+        require(len(actions) == len(active), "planner", f"actions of {len(active)} episodes", f"shape {actions.shape}")
+        continuing = []
+        for row, action in zip(active, actions, strict=True):
+            advance()
+            if not np.isfinite(action).all():
+                fail(row, f"step {step}: the plan is not finite")
                 continue
-            observe(row, 0, observation)
-            environments[row] = environment
-        active = list(environments)
-        for step in range(loop.steps):
-            if not active:
-                break
-            actions = policy(take(current, [row - rows.start for row in active]), active, step).numpy().astype(np.float32)
-            require(len(actions) == len(active), "planner", f"actions of {len(active)} episodes", f"shape {actions.shape}")
-            continuing = []
-            for row, action in zip(active, actions, strict=True):
-                advance()
-                if not np.isfinite(action).all():
-                    fail(row, f"step {step}: the plan is not finite")
-                    continue
-                try:
-                    observation, _, terminated, truncated, info = environments[row].step(action)
-                except (MemoryError, OSError):
-                    raise
-                except Exception as error:  # as above
-                    fail(row, f"step {step}: {error!r}")
-                    continue
-                observe(row, step + 1, observation)
-                rollout.infos[row].update(info)
-                if not (terminated or truncated):
-                    continuing.append(row)
-            advance((len(active) - len(continuing)) * (loop.steps - step - 1))  # remaining steps of ended episodes
-            active = continuing
+            try:
+                observation, reward, terminated, truncated, info = environments[row].step(action)
+            except (MemoryError, OSError):
+                raise
+            except Exception as error:  # as above
+                fail(row, f"step {step}: {error!r}")
+                continue
+            seen(row, step + 1, observation, float(reward), info)
+            if not (terminated or truncated):
+                continuing.append(row)
+        advance((len(active) - len(continuing)) * (steps - step - 1))  # remaining steps of ended episodes
+        active = continuing
 
 
 class PlanFollower:

@@ -19,6 +19,8 @@ from ftl_lightning.data.features import PINNED, InitialStates, moved
 from ftl_lightning.domains.domain import Domain, closed_loop_of
 from ftl_lightning.evaluation.closed_loop import reset
 from ftl_lightning.evaluation.execution import Execution, episodes
+from ftl_lightning.evaluation.policy import Control, Policy
+from ftl_lightning.evaluation.rollout import Episodes, rollout
 from ftl_lightning.few_shot.arrays import (
     Start,
     check_of_domain,
@@ -55,6 +57,7 @@ from ftl_lightning.training.model_folder import load_model
 from ftl_lightning.training.quality import judged, judging_domain, picture
 
 if TYPE_CHECKING:
+    import gymnasium
     from matplotlib.figure import Figure
 
 
@@ -63,6 +66,7 @@ PLANS = 10
 GIVEN = {
     "sample": ("count", "observed", "seed", "pin", "batch_size", "progress"),
     "execute": ("scenes", "goal", "replan", "environment", "seed"),
+    "policy": ("execute", "replan", "act", "observe", "seed"),
 }
 """Arguments besides the sampler's settings."""
 
@@ -546,6 +550,78 @@ class FewShot(Shown):
         starts = scenes if isinstance(scenes, InitialStates) else reset(loop, scenes_of(scenes))
         rollout, followed = episodes(self.model, loop, concept, starts, sampling, every, seed)
         return Execution(self.domain, goal, rollout, followed)
+
+    @usual_modes()
+    def policy(
+        self,
+        concept: Composition,
+        execute: int = 8,
+        replan: int | None = None,
+        *,
+        act: Control | None = None,
+        observe: Callable[[Any], Any] | None = None,
+        seed: int = 0,
+        **changes: Any,
+    ) -> Policy:
+        """Make a receding-horizon policy of a concept, for one environment or a batch of them.
+
+        With a user's data, a plan is sampled where an episode begins and corrected to the present state every ``execute`` steps.
+        With a domain that has an environment, a plan is sampled every ``execute`` steps.
+
+        Args:
+            concept: as in :meth:`sample`.
+            execute: number of steps of a plan before it is corrected or replaced.
+            replan: number of steps after which a plan is sampled again, through the present state; ``None`` for never with a
+                user's data, for ``execute`` with other domains.
+            act: with a user's data, controller ``(present states (episode, state), next planned states) -> actions``, arrays;
+                ``None`` for the actions of the data: by an inverse model if it explains them, else as planned. The policy's text
+                says which.
+            observe: function of an observation that returns what :meth:`Policy.act
+                <ftl_lightning.evaluation.policy.Policy.act>` accepts; ``None`` for the observation itself.
+            seed: seed of the noise.
+            changes: as in :meth:`sample`.
+
+        Raises:
+            UserError: for a concept of another model, or a domain with neither an environment nor a user's data.
+        """
+        concept, sampling = self._own("policy", concept), self._sampling("policy", changes)
+        execute, seed = check_whole("execute", execute, 1), check_whole("seed", seed, 0, None)
+        replan = None if replan is None else check_whole("replan", replan, 1)
+        return Policy(self.model, concept, sampling, execute, replan, act, observe, seed)
+
+    @usual_modes()
+    def rollout(
+        self,
+        policy: Policy,
+        environment: "str | Callable[[], gymnasium.Env[Any, Any]] | gymnasium.Env[Any, Any]",
+        episodes: int = 50,
+        success: str | Callable[[Mapping[str, Any]], bool] | None = None,
+        *,
+        steps: int | None = None,
+        seed: int = 0,
+    ) -> Episodes:
+        """Evaluate a policy in a Gymnasium environment of one's own.
+
+        Args:
+            policy: such as :meth:`policy` returns.
+            environment: name of a registered environment, a function that makes it, or an environment, in which episodes run one
+                after another. Episode i is reset with the seed ``seed + i``.
+            episodes: number of episodes.
+            success: ``'info.KEY'``, a key of the ``info`` of an episode's last step, or a function of this ``info``; ``None`` for
+                ``is_success`` or ``success``, if there is such a key.
+            steps: maximum number of steps of an episode; ``None`` for the environment's limit, or 1,000.
+            seed: seed of the environment and of the noise.
+
+        Returns:
+            Success with its interval, returns, lengths, pictures of the first episode, and the time that an action chunk takes.
+
+        Raises:
+            UserError: for an environment that cannot be made, or observations or actions that do not fit.
+        """
+        if not isinstance(policy, Policy):
+            raise UserError(f"policy: expected a policy, such as model.policy(concept), found {shown(policy)}")
+        episodes, seed = check_whole("episodes", episodes, 1), check_whole("seed", seed, 0, None)
+        return rollout(policy, environment, episodes, success, None if steps is None else check_whole("steps", steps, 1), seed)
 
     def save_pretrained(self, folder: str | Path) -> None:
         """Write ``config.json`` and ``model.safetensors`` to a folder, and a ``README.md`` unless it exists."""

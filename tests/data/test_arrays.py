@@ -143,7 +143,7 @@ def test_other_lists_of_demonstrations_are_refused(states: Any, expected: str) -
         ("Observed/start", "an observed feature is named 'observed/start'"),
         ("concept", "the nearest known name is 'concepts'"),
         ("state_name", "the nearest known name is 'state_names'"),
-        ("actions", "known are states, lengths, "),
+        ("rewards", "known are states, lengths, "),
     ],
 )
 @pytest.mark.parametrize("suffix", ["npz", "json", "h5", "mat", "pt"])

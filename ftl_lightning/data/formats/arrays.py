@@ -10,8 +10,8 @@ file                   content
 ``.mat``               MATLAB variables up to version 7, ``observed`` as a struct; states may be a cell array
 ``.h5``, ``.hdf5``     data sets, ``observed/NAME`` in a group; needs the extra ``hdf5``
 ``.pt``, ``.pth``      tensors by name, or states alone, or a list of states; read without unpickling objects
-``.csv``               a table with a row for each time: ``demonstration``, ``concept``, optionally ``time``; all other columns of
-                       numbers are the columns of a state
+``.csv``               a table with a row for each time: ``demonstration``, ``concept``, optionally ``time``; columns of numbers
+                       whose names begin with ``action`` are actions, all others are the columns of a state
 ``.parquet``           the same; needs the extra ``lerobot``
 =====================  ==========================================================================================================
 """
@@ -30,6 +30,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ftl_lightning.data.actions import action_columns, held_actions
 from ftl_lightning.data.demonstrations import FORMATS, OBSERVED, Contents, Demonstrations, Format, gathered, stacked
 from ftl_lightning.data.features import check_single, check_whole, precise
 from ftl_lightning.data.formats.files import DAMAGED, MOST_ARRAYS, TEXTS, check_array, check_arrays, contents_of, write_npz
@@ -43,7 +44,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
 Arrays = dict[str, NDArray[Any]]
-NUMBERS = ("states", "lengths", "scenes")
+ACTIONS = "actions"
+"""Key of actions ``(demo, time, action)``, or ``(demo, time - 1, action)``."""
+NUMBERS = ("states", "lengths", "scenes", ACTIONS)
 """Keys of arrays of numbers, besides observed features."""
 EPISODE, CONCEPT = ("demonstration", "demo", "episode", "episode_index"), ("concept", "task")
 TIME = ("time", "step", "frame_index", "timestamp", "t")
@@ -86,7 +89,7 @@ def contents_of_arrays(arrays: Mapping[str, NDArray[Any]], place: str) -> Conten
         labels = _LABELS.fullmatch(key) and (not _is_numeric(key) or array.dtype.kind in "USO")
         found = "names or units, which are not compared; give the columns in the model's order and units, and leave this array out"
         require(not labels, f"key {short(key)!r}", "no names and units of observed features", found)
-    for key in ("states", *per_step):
+    for key in ("states", ACTIONS, *per_step):
         if key in arrays and arrays[key].dtype.kind == "O":
             with about(f"key {short(key)!r}"):
                 try:
@@ -95,6 +98,8 @@ def contents_of_arrays(arrays: Mapping[str, NDArray[Any]], place: str) -> Conten
                     _check_null(arrays[key], timed=True)
                     raise
             given = arrays.setdefault("lengths", lengths.numpy())
+            if key == ACTIONS and np.array_equal(given, lengths + 1):
+                lengths = lengths + 1  # the last state has no action
             require(np.array_equal(given, lengths), "key 'lengths'", f"the lengths of {short(key)!r}", "others")
             arrays[key] = whole.numpy()
     states = np.atleast_1d(arrays["states"])
@@ -114,6 +119,8 @@ def contents_of_arrays(arrays: Mapping[str, NDArray[Any]], place: str) -> Conten
             repeated = len(states) if key == "concepts" and not array.ndim else 1
             header[key] = texts[0] if key == "domain" and len(texts) == 1 else texts * repeated
     contents = contents_of(tensors, header)
+    if contents["actions"] is not None:
+        contents["actions"] = held_actions(contents["actions"], contents["lengths"], states.shape[1] if states.ndim > 1 else 0)
     _note_unread(place, {f"array {short(key)!r} is not read; {_nearest(key)}" for key in arrays if not _is_known(key)})
     return contents
 
@@ -483,8 +490,14 @@ def _of_table(table: "pd.DataFrame", path: Path) -> Arrays:
     firsts = order[np.cumsum(lengths) - lengths]
     if (np.diff(order) < 0).any():
         numbers = numbers[order]
-    arrays: Arrays = {"states": gathered(numbers, lengths), "lengths": lengths}
-    arrays["state_names"] = np.array([str(name) for name in numeric], dtype=object)
+    names = tuple(map(str, numeric))
+    acts = action_columns(names)
+    require(len(acts) < len(names), "columns", "columns of a state beside those of actions", short(", ".join(names)))
+    arrays: Arrays = {"lengths": lengths}
+    for key, chosen in (("state", [c for c in range(len(names)) if c not in acts]), ("action", list(acts))):
+        if chosen:
+            arrays[f"{key}s"] = gathered(numbers[:, chosen], lengths)
+            arrays[f"{key}_names"] = np.array([names[column] for column in chosen], dtype=object)
     if concept is not None:
         kinds, different = pd.factorize(table[concept])
         texts = [*map(str, different), ""]  # the last for -1, a missing one

@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ftl_lightning.data.actions import held_actions
 from ftl_lightning.data.demonstrations import Contents, Demonstrations, padded
 from ftl_lightning.data.features import precise
 from ftl_lightning.services.errors import require, short
@@ -27,12 +28,14 @@ class Episode:
         observed: features at each time, by name ``(time, *shape)``, float32, or uint8 for images.
         concept: text of the concept; empty if unknown.
         scene: ``(scene,)`` float32, which resets the environment to the initial state; ``None`` if there is none.
+        actions: ``(time, action)`` or ``(time - 1, action)``; ``None`` if unknown.
     """
 
     states: NDArray[Any]
     observed: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     concept: str = ""
     scene: NDArray[np.float32] | None = None
+    actions: NDArray[Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -46,6 +49,8 @@ class Metadata:
             and known only at its start.
         provenance: origin of the demonstrations.
         state_kinds: kind of each column; empty if all are linear.
+        action_names: an entry for each action; empty for numbers.
+        acted: whether the written actions are those of the demonstrations, and not what a format requires.
     """
 
     domain: str = ""
@@ -54,12 +59,15 @@ class Metadata:
     per_step: tuple[str, ...] | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
     state_kinds: tuple[str, ...] = ()
+    action_names: tuple[str, ...] = ()
+    acted: bool = False
 
 
 def metadata(demonstrations: Demonstrations) -> dict[str, Any]:
     """Attributes of :class:`Metadata` as JSON can hold them."""
-    names = ("domain", "state_names", "state_units", "per_step", "provenance", "state_kinds")
-    return asdict(Metadata(**{name: getattr(demonstrations, name) for name in names}))
+    names = ("domain", "state_names", "state_units", "per_step", "provenance", "state_kinds", "action_names")
+    attributes = {name: getattr(demonstrations, name) for name in names}
+    return asdict(Metadata(**attributes, acted=demonstrations.actions is not None))
 
 
 def to_episodes(demonstrations: Demonstrations) -> Iterator[Episode]:
@@ -73,7 +81,8 @@ def to_episodes(demonstrations: Demonstrations) -> Iterator[Episode]:
             for name, values in demonstrations.observed.items()
         }
         scene = None if scenes is None else scenes[row].numpy()
-        yield Episode(demonstrations.states[row, :length].numpy(), observed, text, scene)
+        actions = None if demonstrations.actions is None else demonstrations.actions[row, :length].numpy()
+        yield Episode(demonstrations.states[row, :length].numpy(), observed, text, scene, actions)
 
 
 def from_episodes(episodes: Sequence[Episode], given: Metadata) -> Contents:
@@ -95,6 +104,8 @@ def from_episodes(episodes: Sequence[Episode], given: Metadata) -> Contents:
     states = torch.from_numpy(precise(whole.numpy()))
     columns = states.shape[2]
     per_step = tuple(name for name in (first.observed if given.per_step is None else given.per_step) if name in first.observed)
+    actions = [_tensor(episode.actions).float() for episode in episodes if episode.actions is not None]
+    require(len(actions) in (0, len(episodes)), "actions", "of every episode, or of none", f"of {len(actions)} episodes")
     scenes = [_tensor(episode.scene) for episode in episodes if episode.scene is not None]
     return {
         "states": states,
@@ -113,6 +124,8 @@ def from_episodes(episodes: Sequence[Episode], given: Metadata) -> Contents:
         "scenes": torch.stack(scenes) if len(scenes) == len(episodes) else None,
         "provenance": given.provenance,
         "state_kinds": given.state_kinds,
+        "actions": held_actions(padded(actions)[0], lengths, states.shape[1]) if actions else None,
+        "action_names": given.action_names if actions else (),
     }
 
 

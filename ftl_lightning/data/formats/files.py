@@ -25,8 +25,10 @@ from ftl_lightning.services.validation import check_type
 VERSION = 4
 """Version of the safetensors format. Images are compressed (zlib) to 1-D uint8; the header has their shapes by key as
 ``compressed``."""
-TEXTS = ("state_names", "state_units", "state_kinds", "concepts", "per_step")
+TEXTS = ("state_names", "state_units", "state_kinds", "concepts", "per_step", "action_names")
 """Keys of lists of texts."""
+OPTIONAL = ("state_kinds", "action_names")
+"""Keys that are not written if they are empty."""
 MOST_SHRUNK = 1032
 """Maximum compression ratio of zlib."""
 MOST_ARRAYS = 2000
@@ -73,7 +75,7 @@ def write_npz(demonstrations: Demonstrations, name: str) -> None:
 
 def _header(demonstrations: Demonstrations) -> dict[str, Any]:
     texts = {key: getattr(demonstrations, key) for key in TEXTS}
-    return {"domain": demonstrations.domain, **{key: value for key, value in texts.items() if key != "state_kinds" or value}}
+    return {"domain": demonstrations.domain, **{key: value for key, value in texts.items() if key not in OPTIONAL or value}}
 
 
 def contents_of(tensors: dict[str, Tensor], header: Mapping[str, Any]) -> Contents:
@@ -100,6 +102,8 @@ def contents_of(tensors: dict[str, Tensor], header: Mapping[str, Any]) -> Conten
         "scenes": tensors.get("scenes"),
         "provenance": check_type(header.get("provenance", {}), Mapping[str, Any], "provenance"),
         "state_kinds": texts.get("state_kinds", ()),
+        "actions": tensors.get("actions"),
+        "action_names": texts.get("action_names", ()),
     }
 
 

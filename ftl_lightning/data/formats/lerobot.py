@@ -107,9 +107,12 @@ def _contents(folder: str | Path, part: str = "", observed: Sequence[str] | None
     lengths, texts = _lengths_and_texts(root, version)
     require(episodes == len(lengths), f"{root / INFO}: key 'total_episodes'", f"{len(lengths)}, as in meta", str(episodes))
     scene = [SCENE] if written and SCENE in features else []
-    shapes = {key: features[key].shape for key in (part, *names, *scene)}
+    acts = metadata.acted if written else part != ACTION and ACTION in features and features[ACTION].numeric
+    if acts and not written:
+        metadata = replace(metadata, action_names=features[ACTION].names or ())
+    shapes = {key: features[key].shape for key in (part, *names, *scene, *[ACTION] * acts)}
     numbers = dict.fromkeys((EPISODE, TASK, FRAME, TIME), (1,))
-    columns = read_columns(root, "data/*/*.parquet", shapes | numbers, (EPISODE, TASK, FRAME), (FRAME, TIME))
+    columns = read_columns(root, "data/*/*.parquet", shapes | numbers, (EPISODE, TASK, FRAME), (FRAME, TIME, ACTION))
     seconds = columns[TIME].reshape(-1).astype(np.float64) if TIME in columns else None
     frames = Frames(columns[EPISODE], columns[TASK], columns.get(FRAME), seconds)
     order = frames.order()
@@ -129,6 +132,7 @@ def _contents(folder: str | Path, part: str = "", observed: Sequence[str] | None
                 {name.removeprefix(OBSERVED): measured(columns[name][start:stop]) for name in names},
                 texts[task],
                 measured(columns[SCENE][start]) if scene and whole else None,  # a scene is the episode's initial state
+                measured(columns[ACTION][start:stop]).reshape(stop - start, -1) if acts and ACTION in columns else None,
             )
         )
     with about(root):
@@ -219,7 +223,7 @@ def _lengths_and_texts(root: Path, version: str) -> tuple[dict[int, int], dict[i
 def write_lerobot(demonstrations: Demonstrations, folder: str | Path, fps: int = 10) -> None:
     """Write a data set for LeRobot and :func:`read_lerobot`, atomically.
 
-    Demonstrations have no actions. The action of a frame is the next state, of the last frame its state, as for a robot controlled
+    Where actions are unknown, that of a frame is the next state, of the last frame its state, as for a robot controlled
     by positions. Scenes and features known only at the start are repeated in each frame.
 
     Args:
@@ -241,7 +245,8 @@ def write_lerobot(demonstrations: Demonstrations, folder: str | Path, fps: int =
     for number, episode in enumerate(to_episodes(demonstrations)):
         frames.append(_columns(episode, number, texts[episode.concept], total, fps))
         total += len(episode.states)
-    names = {STATE: demonstrations.state_names, ACTION: demonstrations.state_names}
+    acts = demonstrations.state_names if demonstrations.actions is None else demonstrations.action_names or None
+    names = {STATE: demonstrations.state_names, ACTION: acts}
     info = {
         "codebase_version": VERSIONS[-1],
         "robot_type": None,
@@ -276,7 +281,7 @@ def _columns(episode: Episode, number: int, task: int, first: int, fps: int) -> 
     steps = np.arange(time)[:, None]
     return {
         STATE: episode.states,
-        ACTION: np.concatenate((episode.states[1:], episode.states[-1:])),
+        ACTION: np.concatenate((episode.states[1:], episode.states[-1:])) if episode.actions is None else episode.actions,
         **{OBSERVED + name: values for name, values in episode.observed.items()},
         **({} if episode.scene is None else {SCENE: np.repeat(episode.scene[None], time, axis=0)}),
         TIME: (steps / fps).astype(np.float32),

@@ -93,8 +93,10 @@ def _contents(name: str, part: str = "", observed: Sequence[str] | None = None) 
             note(line(f"{name}: left out {short(', '.join(left), 150)}: only vectors are read"))
         text = _text(attributes) or name
         spaces = {key: parts[key] for key in (part, *features)}
+        acts = dataset.action_space if hasattr(dataset.action_space, "low") and len(dataset.action_space.shape) == 1 else None
+        acts = None if written and not metadata.acted else acts
         with about(name), _raw(dataset, folder) as raw:
-            episodes = [_episode(number, episode, spaces, text, written) for number, episode in enumerate(raw)]
+            episodes = [_episode(number, episode, spaces, acts, text, written) for number, episode in enumerate(raw)]
     except _DAMAGED as error:
         message = short(str(error), 100)
         raise UserError(f"{name}: expected a Minari data set, found a damaged or foreign one ({message})") from error
@@ -134,9 +136,10 @@ def _check_space(space: Any, key: str) -> int:
 
 @dataclass(frozen=True)
 class _Raw:
-    """Episode as it is stored: a reader of a part of its observations by key, its infos and its metadata."""
+    """Episode as it is stored: a reader of a part of its observations by key, its actions, its infos and its metadata."""
 
     part: Callable[[str], Any]
+    actions: Any
     infos: Mapping[str, Any]
     metadata: Mapping[str, Any]
 
@@ -149,7 +152,7 @@ def _raw(dataset: Any, folder: Path) -> Iterator[Iterator[_Raw]]:
     if dataset.storage.FORMAT != "hdf5":
         _check_tables(dataset, folder)
         rows = zip(dataset, dataset.storage.get_episode_metadata(dataset.episode_indices), strict=True)
-        yield (_Raw(partial(part_of, episode.observations), episode.infos or {}, metadata) for episode, metadata in rows)
+        yield (_Raw(partial(part_of, episode.observations), episode.actions, episode.infos or {}, metadata) for episode, metadata in rows)
         return
     from ftl_lightning.data.formats.hdf5_file import opened
 
@@ -161,7 +164,8 @@ def _raw(dataset: Any, folder: Path) -> Iterator[Iterator[_Raw]]:
             group = file[f"episode_{number}"]
             infos = {key: _array(group, f"infos/{key}") for key in (CONCEPT, SCENE)}
             first = {key: found[:1] if found.shape else found[()] for key, found in infos.items() if found is not None}
-            return _Raw(lambda key: _array(group["observations"], key), first, {CONCEPT: group.attrs.get(CONCEPT, "")})
+            texts, actions = {CONCEPT: group.attrs.get(CONCEPT, "")}, _array(group, "actions")
+            return _Raw(lambda key: _array(group["observations"], key), actions, first, texts)
 
         yield map(read, range(count))
 
@@ -188,8 +192,8 @@ def _check_tables(dataset: Any, folder: Path) -> None:
     check_unpacked(sum(table.count_rows() for table in tables) * width, packed, "episodes")
 
 
-def _episode(number: int, episode: _Raw, spaces: Mapping[str, Any], text: str, written: bool) -> Episode:
-    """Convert an episode; ``spaces`` are those of the states, which are the first, and of the features."""
+def _episode(number: int, episode: _Raw, spaces: Mapping[str, Any], acts: Any, text: str, written: bool) -> Episode:
+    """Convert an episode; ``spaces`` are those of the states, which are the first, and of the features, ``acts`` of actions."""
     parts = {key: _numbers(f"episode {number}: {key or 'observations'}", episode.part(key), space) for key, space in spaces.items()}
     (part, states), *features = parts.items()
     for key, values in features:
@@ -200,6 +204,7 @@ def _episode(number: int, episode: _Raw, spaces: Mapping[str, Any], text: str, w
         {key: measured(values) for key, values in features},
         _text(episode.infos) or _text(episode.metadata) or text,
         measured(episode.infos[SCENE])[0] if written and SCENE in episode.infos else None,
+        None if acts is None else measured(_numbers(f"episode {number}: actions", episode.actions, acts)),
     )
 
 
@@ -226,7 +231,7 @@ def write_minari(demonstrations: Demonstrations, name: str) -> None:
     """Write a data set for Minari and :func:`read_minari`, with an episode for each demonstration.
 
     With observed features, an observation is a dictionary: the states as ``'observation'``, and each feature by its name.
-    Demonstrations have no actions: the actions and rewards that Minari requires are 0.
+    Rewards, which Minari requires, are 0, and so are actions that are unknown. The action in the last state is left out.
 
     Args:
         demonstrations: at least two states each, since n steps have n + 1 observations.
@@ -252,6 +257,9 @@ def write_minari(demonstrations: Demonstrations, name: str) -> None:
             low, high, dtype = (0, 255, np.uint8) if feature.kind == "image" else (-np.inf, np.inf, np.float32)
             spaces[key] = Box(low, high, feature.shape, dtype)
         space = gymnasium.spaces.Dict(spaces)
+    acts = Box(0, 0, (1,), np.float32)
+    if demonstrations.actions is not None:
+        acts = Box(-np.inf, np.inf, demonstrations.actions.shape[2:], np.float32)
     buffers = []
     for episode in to_episodes(demonstrations):
         steps = len(episode.states) - 1
@@ -260,7 +268,7 @@ def write_minari(demonstrations: Demonstrations, name: str) -> None:
         buffers.append(
             EpisodeBuffer(
                 observations=features if episode.observed else features[PART],
-                actions=list(np.zeros((steps, 1), np.float32)),
+                actions=list(np.zeros((steps, 1), np.float32) if episode.actions is None else episode.actions[:-1]),
                 rewards=[0.0] * steps,
                 terminations=[False] * steps,
                 truncations=[False] * (steps - 1) + [True],
@@ -270,7 +278,7 @@ def write_minari(demonstrations: Demonstrations, name: str) -> None:
     try:
         with warnings.catch_warnings(action="ignore"):  # advice about author, permalink and so on
             written = minari.create_dataset_from_buffers(
-                name, buffers, observation_space=space, action_space=Box(0, 0, (1,), np.float32), jpeg_encoding=False
+                name, buffers, observation_space=space, action_space=acts, jpeg_encoding=False
             )
             written.storage.update_metadata({_HEADER: metadata(demonstrations)})
     except (ImportError, OSError, ValueError, AttributeError, TypeError) as error:

@@ -1,0 +1,313 @@
+"""Receding-horizon policies: plans of a concept, executed in a domain's environment or in one's own."""
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+from ftl_lightning.data.actions import InverseModel, action_columns
+from ftl_lightning.data.features import PINNED, Observed, moved
+from ftl_lightning.data.pinned import Pinned
+from ftl_lightning.domains.domain import closed_loop_of
+from ftl_lightning.evaluation.closed_loop import PlanFollower, planner, sampled_plans
+from ftl_lightning.igm.composition import Composition
+from ftl_lightning.igm.samplers import Sampling
+from ftl_lightning.services.errors import UserError, require, short, shown
+from ftl_lightning.services.randomness import generator
+from ftl_lightning.services.text import Shown, counted
+from ftl_lightning.training.concept_model import ConceptModel
+
+STATE = "(state)"  # no user's feature has this name
+"""Key of the present states among observed features."""
+NAMES = ("state", "states", "observation", "observation.state", "agent_pos")
+"""Keys of the present state in an observation that is a dictionary."""
+EXPLAINED = 0.1
+"""Maximum error of an inverse model, as a share of the variance of actions, for actions to be obtained from planned states."""
+REST = 0.2
+"""Maximum length of the last step of behaviour that ends at rest, relative to its mean step."""
+Control = Callable[[NDArray[np.float32], NDArray[np.float32]], ArrayLike]
+"""Controller: ``(present states (episode, state), next planned states (episode, state)) -> actions (episode, action)``."""
+
+
+class Follower(Protocol):
+    """Policy of episodes in lockstep.
+
+    Attributes:
+        followed: plan ``(horizon, state)`` at each step, by episode.
+    """
+
+    followed: dict[int, list[Tensor]]
+
+    def __call__(self, observed: Observed, rows: list[int], step: int, /) -> Tensor:
+        """Actions ``(episode, action)`` of some episodes (``rows``) for their observed features ``(episode, *shape)``."""
+        ...
+
+
+class Acting:
+    """How actions are obtained from plans of a user's data.
+
+    With a controller, or without actions in the demonstrations, from the next planned state. Otherwise by an inverse model of the
+    present and the next planned state, if it explains the actions of demonstrations that were left out of its fit; if not, actions
+    are those of the plan.
+
+    Args:
+        model: model of a user's data.
+        control: controller; ``None`` for none.
+    """
+
+    def __init__(self, model: ConceptModel, control: Control | None) -> None:
+        columns = model.domain.plans.columns
+        self.actions = list(action_columns(columns))
+        self.states = [column for column in range(len(columns)) if column not in self.actions]
+        self._control, self._inverse = control, None
+        if control is not None:
+            self.words = "actions by the given controller from the next planned state"
+        elif not self.actions:
+            self.words = "actions are the next planned state, as demonstrations have no actions"
+        else:
+            examples = model.examples
+            assert examples is not None
+            states, actions = examples.states[..., self.states], examples.states[..., self.actions]
+            inverse = InverseModel.fit(states, actions, examples.lengths)
+            self._inverse = inverse if inverse.error <= EXPLAINED else None
+            source = "actions by an inverse model from the next planned state" if self._inverse else "actions as planned"
+            self.words = f"{source}; such a model explains {max(1 - inverse.error, 0):.0%} of the variance of actions"
+
+    def __call__(self, present: Tensor, plans: Tensor, age: int) -> Tensor:
+        """Actions ``(episode, action)`` at a time (``age``) of plans ``(episode, horizon, column)``."""
+        following = plans[:, min(age + 1, plans.shape[1] - 1), self.states]
+        if self._control is not None:
+            return torch.as_tensor(np.asarray(self._control(present.numpy(), following.numpy()), dtype=np.float32))
+        if self._inverse is not None:
+            return self._inverse(present, following)
+        return plans[:, min(age, plans.shape[1] - 1), self.actions] if self.actions else following
+
+
+class WholePlans:
+    """Follow plans of whole behaviour, which are corrected to the present state every few steps.
+
+    A plan begins where the episode does, with what is observed there. A correction moves the plan so that it passes the present
+    state, and fades, see :class:`~ftl_lightning.data.pinned.Pinned`. At its end a plan is held if demonstrations end at rest;
+    otherwise another one begins.
+
+    Args:
+        model: model of a user's data.
+        compositions: ``(batch size) -> composition of each episode``.
+        seed: seed of the noise; each episode has a generator.
+        sampling: sampler, steps and temperature.
+        acting: see :class:`Acting`.
+        execute: steps between corrections.
+        replan: steps after which plans are sampled again, through the present state; ``None`` for never.
+    """
+
+    def __init__(
+        self,
+        model: ConceptModel,
+        concept: Composition,
+        seed: int,
+        sampling: Sampling,
+        acting: Acting,
+        execute: int,
+        replan: int | None,
+    ) -> None:
+        self._model, self._concept, self._seed, self._sampling = model, concept, seed, sampling
+        self._acting, self._execute, self._replan = acting, execute, replan
+        self._first: dict[int, dict[str, Tensor]] = {}
+        self._begun = 0
+        self.followed: dict[int, list[Tensor]] = {}
+        self._rests = _ends_at_rest(model)
+
+    def __call__(self, observed: Observed, rows: list[int], step: int) -> Tensor:
+        if step == 0 or (step - self._begun >= self._model.horizon - 1 and not self._rests):
+            self._begun = step
+            self._first |= {row: {name: values[index] for name, values in observed.items()} for index, row in enumerate(rows)}
+        age, present = step - self._begun, observed[STATE]
+        if age == 0 or (self._replan and age % self._replan == 0 and age < self._model.horizon - 1):
+            plans = self._sampled(rows, present, age)
+        else:
+            plans = torch.stack([self.followed[row][-1] for row in rows])
+            if age % self._execute == 0 and age < self._model.horizon:
+                plans = self._corrected(plans, rows, present, age)
+        for row, plan in zip(rows, plans, strict=True):
+            self.followed.setdefault(row, []).append(plan)
+        return self._acting(present, plans, age)
+
+    def _sampled(self, rows: list[int], present: Tensor, age: int) -> Tensor:
+        """Plans that pass the present state at a time (``age``); the same noise for every plan of an episode."""
+        draws = [generator("cpu", self._seed, 1, row) for row in rows]
+        features = self._features(rows)
+        if self._model.max_steps is not None:
+            features[PINNED] = self._known(present, age)
+        device = self._model.device
+        parts = [self._concept.drawn(draw) for draw in draws]
+        plans = self._model.sample(parts, 1, self._sampling, draws, moved(features, device))[:, 0].cpu()
+        return plans if self._model.max_steps is not None else self._corrected(plans, rows, present, age)
+
+    def _features(self, rows: list[int]) -> dict[str, Tensor]:
+        return {name: torch.stack([self._first[row][name] for row in rows]) for name in self._model.domain.observed}
+
+    def _known(self, present: Tensor, age: int) -> Tensor:
+        known = torch.full((len(present), self._model.horizon, len(self._model.domain.plans.columns)), torch.nan)
+        known[:, age, self._acting.states] = present.float()
+        return known
+
+    def _corrected(self, plans: Tensor, rows: list[int], present: Tensor, age: int) -> Tensor:
+        features = self._features(rows)
+        model = self._model
+        values, before = (model.encode(states.to(model.device), features).cpu() for states in (self._known(present, age), plans))
+        mask = ~values.isnan()
+        mask[:, torch.arange(mask.shape[1]) != age] = False  # constant columns are known at every time
+        return model.decode(Pinned(mask, values.nan_to_num())(before).to(model.device), features).cpu()
+
+
+def _ends_at_rest(model: ConceptModel) -> bool:
+    """Whether most demonstrations of a user's data end at rest."""
+    examples = model.examples
+    assert examples is not None
+    ends = []
+    for path, length in zip(examples.states, examples.lengths.tolist(), strict=True):
+        steps = path[:length].diff(dim=0).norm(dim=1)
+        ends.append(bool(len(steps) < 2 or steps[-1] <= REST * steps.mean()))
+    return sum(ends) * 2 > len(ends)
+
+
+class Policy(Shown):
+    """Receding-horizon policy of a concept, for one environment or a batch of them in lockstep.
+
+    Attributes:
+        words: how actions are obtained.
+    """
+
+    def __init__(
+        self,
+        model: ConceptModel,
+        concept: Composition,
+        sampling: Sampling,
+        execute: int,
+        replan: int | None = None,
+        act: Control | None = None,
+        observe: Callable[[Any], Any] | None = None,
+        seed: int = 0,
+    ) -> None:
+        self.model, self.concept, self.execute = model, concept, execute
+        self._sampling, self._replan, self._observe, self._seed = sampling, replan, observe, seed
+        # A user's data have examples and no environment.
+        self._acting = Acting(model, act) if model.domain.closed_loop is None and model.examples is not None else None
+        if self._acting is None:
+            closed_loop_of(model.domain)
+            require(act is None, "act", f"none, as {model.domain.name} has a planner", "a controller")
+        self.words = "actions by the domain's planner" if self._acting is None else self._acting.words
+        self._following: Follower | None = None
+        self._step, self._batch = 0, False
+
+    def _words(self) -> Iterator[str]:
+        yield repr(self.model.domain.name)
+        yield f"{counted(self.execute, 'step')} of each plan"
+        yield self.words
+
+    def following(self, count: int, seed: int) -> Follower:
+        """Policy of ``count`` episodes in lockstep, whose noise depends on seed and episode."""
+        if self._acting is not None:
+            settings = (self._sampling, self._acting, self.execute, self._replan)
+            return WholePlans(self.model, self.concept, seed, *settings)
+        draws = [generator("cpu", seed, 1, episode) for episode in range(count)]
+        make = sampled_plans(self.model, [self.concept] * count, self._sampling, draws)
+        return PlanFollower(make, planner(self.model, closed_loop_of(self.model.domain)), self._replan or self.execute)
+
+    def reset(self, seed: int | None = None) -> None:
+        """Begin new episodes; ``seed`` is that of the noise, the last one if ``None``."""
+        self._seed = self._seed if seed is None else seed
+        self._following, self._step = None, 0
+
+    def act(self, observation: Any) -> NDArray[np.float32]:
+        """Action ``(action,)`` for an observation, or ``(episode, action)`` for a batch of observations.
+
+        Args:
+            observation: a dictionary of observed features by name and, for a user's data, of the present state, named ``state``
+                or ``observation``; or a vector: the present state, followed by observed features in the model's order.
+
+        Raises:
+            UserError: for an observation that lacks a feature or has another shape.
+        """
+        observed, batch = self.observed(observation)
+        count = len(next(iter(observed.values())))
+        if self._following is None:
+            self._following, self._batch = self.following(count, self._seed), batch
+        require(len(self._following.followed) in (0, count), "act", f"a batch of {len(self._following.followed)}", count)
+        with torch.inference_mode():
+            actions = self._following(observed, list(range(count)), self._step).numpy().astype(np.float32)
+        self._step += 1
+        return actions if batch else actions[0]
+
+    @property
+    def plan(self) -> Tensor | None:
+        """Present plan ``(horizon, state)``, or ``(episode, horizon, state)`` of a batch; ``None`` before the first action."""
+        if self._following is None or not self._following.followed:
+            return None
+        plans = torch.stack([plans[-1] for plans in self._following.followed.values()])
+        return plans if self._batch else plans[0]
+
+    def observed(self, observation: Any) -> tuple[dict[str, Tensor], bool]:
+        """Observed features ``(episode, *shape)`` by name, with the present state, and whether the observation is a batch.
+
+        Raises:
+            UserError: for an observation that lacks a feature or has another shape.
+        """
+        given = observation if self._observe is None else self._observe(observation)
+        features = self.model.domain.observed
+        shapes = {name: feature.shape for name, feature in features.items()}
+        if self._acting is None:
+            require(isinstance(given, Mapping), "observation", f"a dictionary of {', '.join(features)}", type(given).__name__)
+            return _by_shape({name: given.get(name) for name in features}, shapes)
+        shapes[STATE] = (len(self._acting.states),)
+        starts = self.model.starts
+        if isinstance(given, Mapping):
+            values = {name: given[name] for name in features if name in given}
+            vectors = [key for key in NAMES if key in given and key not in features]
+            vectors += [key for key, value in given.items() if key not in features and np.shape(value)[-1:] == shapes[STATE]]
+            if vectors:
+                values[STATE] = given[vectors[0]]
+        else:
+            values = _of_vector(_numbers("observation", given), shapes, starts)
+        for name, columns in starts.items():
+            if name not in values and STATE in values:
+                values[name] = _numbers("state", values[STATE])[..., [self._acting.states.index(column) for column in columns]]
+        return _by_shape({name: values.get(name) for name in shapes}, shapes)
+
+
+def _of_vector(vector: Tensor, shapes: Mapping[str, tuple[int, ...]], starts: Mapping[str, Any]) -> dict[str, Any]:
+    """Parts of a vector ``(..., size)``: the state, then observed features in order, without those that equal the first state."""
+    parts = {STATE: shapes[STATE], **{name: shape for name, shape in shapes.items() if name != STATE and name not in starts}}
+    sizes = [int(np.prod(shape)) for shape in parts.values()]
+    words = " + ".join(f"{size} ({'state' if name == STATE else name})" for name, size in zip(parts, sizes, strict=True))
+    require(vector.shape[-1:] == (sum(sizes),), "observation", f"a vector of {words} numbers; give observe=", tuple(vector.shape))
+    every = vector.split(sizes, dim=-1)
+    return {name: part.unflatten(-1, parts[name]) for name, part in zip(parts, every, strict=True)}
+
+
+def _numbers(place: str, value: Any) -> Tensor:
+    try:
+        array = np.asarray(value)
+        tensor = torch.from_numpy(np.array(array, dtype=np.uint8 if array.dtype == np.uint8 else np.float32))
+    except (TypeError, ValueError):
+        raise UserError(f"{place}: expected numbers, found {shown(value)}") from None
+    require(bool(tensor.isfinite().all()), place, "finite numbers", "others")
+    return tensor
+
+
+def _by_shape(values: Mapping[str, Any], shapes: Mapping[str, tuple[int, ...]]) -> tuple[dict[str, Tensor], bool]:
+    """Tensors ``(episode, *shape)``, and whether they were a batch."""
+    observed, batches = {}, set()
+    for name, value in values.items():
+        label = "the present state (key 'state')" if name == STATE else repr(short(name))
+        require(value is not None, "observation", f"{label} of shape {shapes[name]}; give observe=", "none")
+        tensor = _numbers(f"observation {label}", value)
+        batches.add(tensor.dim() > len(shapes[name]))
+        tensor = tensor if tensor.dim() > len(shapes[name]) else tensor[None]
+        require(tensor.shape[1:] == shapes[name], "observation", f"{label} of shape {shapes[name]}", tuple(tensor.shape[1:]))
+        observed[name] = tensor
+    require(len(batches) == 1, "observation", "a batch of every feature, or of none", "both")
+    return observed, batches.pop()

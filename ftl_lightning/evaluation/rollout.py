@@ -1,0 +1,226 @@
+"""Episodes of a policy in a user's Gymnasium environment: success, returns, films and latency."""
+
+import math
+import statistics
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, closing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ftl_lightning.evaluation.closed_loop import lock_step
+from ftl_lightning.evaluation.pictures import gif
+from ftl_lightning.evaluation.policy import Policy
+from ftl_lightning.services.errors import UserError, require, short, shown
+from ftl_lightning.services.progress import bar
+from ftl_lightning.services.tensor_file import atomic
+from ftl_lightning.services.text import Shown, counted
+
+if TYPE_CHECKING:
+    import gymnasium
+
+Environment = "str | Callable[[], gymnasium.Env[Any, Any]] | gymnasium.Env[Any, Any]"
+SUCCESSES = ("is_success", "success")
+"""Keys of success in an environment's ``info``, tried in this order."""
+SIDE_BY_SIDE = 16
+"""Maximum number of environments that are made."""
+LONGEST = 1000
+"""Maximum steps of an episode in an environment without a limit of its own."""
+TIMED = 20
+"""Number of chunks that measure the latency."""
+Z = 1.96
+"""Standard normal quantile of a 95 % interval."""
+
+
+@dataclass(frozen=True, repr=False)
+class Episodes(Shown):
+    """Episodes in an environment.
+
+    Attributes:
+        successes: ``(episode,)`` of bool; ``None`` if success is unknown.
+        returns: sum of the rewards of each episode.
+        lengths: number of steps of each episode.
+        failed: episodes without a finite action or with an error of the environment, which are no success.
+        infos: the environment's ``info`` of each episode's last step.
+        milliseconds: processor wall time of each chunk of a single episode: the action after which a plan is sampled or corrected.
+        first_milliseconds: time of the first action of a single episode, which samples the plan.
+        frames: pictures of the first episode ``(height, width, 3)``, if the environment renders them.
+    """
+
+    successes: tuple[bool, ...] | None
+    returns: tuple[float, ...]
+    lengths: tuple[int, ...]
+    failed: tuple[bool, ...]
+    infos: tuple[Mapping[str, Any], ...]
+    milliseconds: tuple[float, ...]
+    first_milliseconds: float
+    frames: tuple[NDArray[np.uint8], ...] = field(default=())
+
+    def __len__(self) -> int:
+        return len(self.returns)
+
+    @property
+    def success(self) -> float:
+        """Share of successful episodes; NaN if success is unknown."""
+        return math.nan if self.successes is None else statistics.fmean(self.successes)
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """95 % interval of the success rate (Wilson, 1927)."""
+        if self.successes is None:
+            return math.nan, math.nan
+        count, rate, square = len(self.successes), self.success, Z**2
+        middle = (rate + square / (2 * count)) / (1 + square / count)
+        half = Z / (1 + square / count) * math.sqrt(rate * (1 - rate) / count + square / (4 * count**2))
+        return max(middle - half, 0.0), min(middle + half, 1.0)
+
+    @property
+    def latency(self) -> tuple[float, float]:
+        """Median and 95th percentile of :attr:`milliseconds`."""
+        return float(np.median(self.milliseconds)), float(np.quantile(self.milliseconds, 0.95))
+
+    def _words(self) -> Iterator[str]:
+        yield counted(len(self), "episode")
+        if self.successes is None:
+            yield "success unknown: name it with success="
+        else:
+            yield "success {:.2f} ({:.2f} to {:.2f})".format(self.success, *self.interval)
+        yield f"return {statistics.fmean(self.returns):.3g}"
+        if any(self.failed):
+            yield f"{sum(self.failed)} failed"
+        yield "a chunk takes {:.1f} ms (95 %: {:.1f})".format(*self.latency)
+
+    def save(self, path: str | Path) -> None:
+        """Save the first episode as an animation; ``path`` ends in .gif.
+
+        Raises:
+            UserError: for another suffix, or an environment that renders no pictures.
+        """
+        require(Path(path).suffix == ".gif", str(path), "a name that ends in .gif", Path(path).suffix or "no ending")
+        found = 'none; make the environment with render_mode="rgb_array"'
+        require(self.frames, "film", "pictures of the first episode", found)
+        with atomic(path) as temporary:
+            temporary.write_bytes(gif(self.frames))
+
+
+def rollout(
+    policy: Policy,
+    environment: "str | Callable[[], gymnasium.Env[Any, Any]] | gymnasium.Env[Any, Any]",
+    episodes: int = 50,
+    success: str | Callable[[Mapping[str, Any]], bool] | None = None,
+    steps: int | None = None,
+    seed: int = 0,
+) -> Episodes:
+    """Run episodes in lockstep, in up to :data:`SIDE_BY_SIDE` environments; see :meth:`FewShot.rollout`."""
+    made = [_made(environment)]
+    several = not hasattr(environment, "step")
+    made += [_made(environment) for _ in range(min(SIDE_BY_SIDE, episodes) - 1 if several else 0)]
+    with ExitStack() as stack:
+        for each in made if several else ():
+            stack.enter_context(closing(each))
+        limit = steps or getattr(made[0].spec, "max_episode_steps", None) or LONGEST
+        record = _Record(policy, made, episodes, seed)
+        with bar(f"{episodes} episodes", limit * episodes, lines=False) as advance:
+            for first in range(0, episodes, len(made)):
+                rows = range(first, min(first + len(made), episodes))
+                record.run(rows, limit, advance)
+        first_time, times = _latency(policy, record.begun, seed)
+    return Episodes(
+        _successes(record.infos, record.failed, success),
+        tuple(record.returns),
+        tuple(record.lengths),
+        tuple(record.failed),
+        tuple(record.infos),
+        times,
+        first_time,
+        tuple(record.frames),
+    )
+
+
+def _made(environment: Any) -> "gymnasium.Env[Any, Any]":
+    import gymnasium
+
+    if isinstance(environment, str):
+        try:
+            return gymnasium.make(environment, render_mode="rgb_array")
+        except (gymnasium.error.Error, ImportError, TypeError) as error:
+            raise UserError(f"environment: expected the name of a Gymnasium environment, found {short(str(error), 150)}") from error
+    made = environment if hasattr(environment, "step") else environment()
+    require(hasattr(made, "step") and hasattr(made, "reset"), "environment", "a Gymnasium environment", shown(made))
+    return made
+
+
+class _Record:
+    """Episodes so far."""
+
+    def __init__(self, policy: Policy, environments: "list[gymnasium.Env[Any, Any]]", episodes: int, seed: int) -> None:
+        self._policy, self._environments, self._seed = policy, environments, seed
+        self._latest: dict[int, Any] = {}
+        self.begun: Any = None
+        self.returns, self.lengths, self.failed = [0.0] * episodes, [0] * episodes, [False] * episodes
+        self.infos: list[dict[str, Any]] = [{} for _ in range(episodes)]
+        self.frames: list[NDArray[np.uint8]] = []
+
+    def run(self, rows: range, steps: int, advance: Callable[..., None]) -> None:
+        """Run episodes in lockstep."""
+        environments = {row: self._environments[row - rows.start] for row in rows}
+        follow = self._policy.following(rows.stop, self._seed)
+        space = environments[rows.start].action_space
+        low, high = getattr(space, "low", None), getattr(space, "high", None)
+
+        def act(active: list[int], step: int) -> NDArray[np.float32]:
+            each = [self._policy.observed(self._latest[row])[0] for row in active]
+            observed = {name: torch.cat([one[name] for one in each]) for name in each[0]}
+            with torch.inference_mode():
+                actions = follow(observed, active, step).numpy().astype(np.float32)
+            if low is None:
+                return actions
+            require(actions.shape[1:] == low.shape, "act", f"actions of shape {low.shape}", actions.shape[1:])
+            return np.where(np.isfinite(actions), actions.clip(low, high), actions).astype(low.dtype)
+
+        def seen(row: int, step: int, observation: Any, reward: float, info: Mapping[str, Any]) -> None:
+            self.begun = observation if self.begun is None else self.begun
+            self._latest[row], self.lengths[row], self.infos[row] = observation, step, dict(info)
+            self.returns[row] += reward
+            if row == 0 and environments[row].render_mode == "rgb_array":
+                self.frames.append(np.asarray(environments[row].render(), dtype=np.uint8))
+
+        def failed(row: int) -> None:
+            self.failed[row] = True
+
+        lock_step(environments, lambda row: environments[row].reset(seed=self._seed + row)[0], act, steps, seen, failed, advance)
+
+
+def _successes(
+    infos: list[dict[str, Any]], failed: list[bool], success: str | Callable[[Mapping[str, Any]], bool] | None
+) -> tuple[bool, ...] | None:
+    """Success of each episode by the ``info`` of its last step; ``None`` if unknown."""
+    if callable(success):
+        return tuple(bool(success(info)) and not lost for info, lost in zip(infos, failed, strict=True))
+    known = [key for key in SUCCESSES if any(key in info for info in infos)]
+    if success is None and not known:
+        return None
+    key = known[0] if success is None else success.removeprefix("info.")
+    keys = short(", ".join(dict.fromkeys(key for info in infos for key in info)), 120) or "none"
+    require(any(key in info for info in infos), "success", f"'info.KEY' with one of {keys}", shown(success))
+    return tuple(bool(np.all(info.get(key, False))) and not lost for info, lost in zip(infos, failed, strict=True))
+
+
+def _latency(policy: Policy, observation: Any, seed: int) -> tuple[float, tuple[float, ...]]:
+    """Milliseconds of the first action and of :data:`TIMED` later chunks of a single episode that stays where it begins."""
+    if observation is None:
+        return math.nan, (math.nan,)
+    follow, times = policy.following(1, seed), []
+    for step in range(1 + TIMED * policy.execute):
+        begin = time.perf_counter()
+        observed, _ = policy.observed(observation)
+        with torch.inference_mode():
+            follow(observed, [0], step)
+        if step % policy.execute == 0:
+            times.append(1000 * (time.perf_counter() - begin))
+    return times[0], tuple(times[1:])
