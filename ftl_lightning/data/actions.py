@@ -11,10 +11,19 @@ from ftl_lightning.services.randomness import generator
 
 ACTION = "action"
 """First word of the names of columns of actions, where they are joined to the columns of states."""
-UNITS_HIDDEN, RIDGES = 512, (1e-8, 1e-6, 1e-4, 1e-2)
-"""Number of random features of the inverse model, and ridge penalties to choose from."""
-LARGEST_FIT = 20_000
-"""Maximum number of transitions that the inverse model is fitted to."""
+PRESENT = "present state"
+"""Observed feature that is added to demonstrations with actions: the state from which a window begins."""
+HIDDEN, RIDGES = 256, (1e-8, 1e-5, 1e-2)
+"""Number of random features of a regression, and ridge penalties to choose from."""
+LARGEST_FIT = 5_000
+"""Maximum number of samples that a regression is fitted to."""
+FOLLOWS = 0.5
+"""Maximum error of actions that are predicted from the present state, relative to those predicted from the initial state and time,
+for plans to begin at the present state."""
+SLACK = 0.05
+"""Error that is no reason to choose, as a share of the variance of actions."""
+MOST_CONCEPTS = 8
+"""Number of concepts that are examined."""
 
 
 def action_columns(names: Sequence[str]) -> tuple[int, ...]:
@@ -45,15 +54,15 @@ def held_actions(actions: Tensor, lengths: Tensor, time: int) -> Tensor:
 
 
 @dataclass(frozen=True)
-class InverseModel:
-    """Actions from consecutive states, by ridge regression on random features of both.
+class Regression:
+    """Ridge regression on random features.
 
     Attributes:
-        centre, scale: mean and standard deviation of a state and of a step ``(2 * state,)``.
-        weights: of the random features ``(1 + 2 * state, feature)``.
-        readout: ``(1 + 2 * state + feature, action)``.
-        low, high: extremes of the actions ``(action,)``.
-        error: mean squared error on demonstrations that were left out of a fit, as a share of the actions' variance.
+        centre, scale: mean and standard deviation of the inputs ``(input,)``.
+        weights: of the random features ``(1 + input, feature)``.
+        readout: ``(1 + input + feature, output)``.
+        low, high: extremes of the outputs ``(output,)``, which limit predictions.
+        error: mean squared error on demonstrations that were left out of a fit, as a share of the outputs' variance.
     """
 
     centre: Tensor
@@ -65,23 +74,18 @@ class InverseModel:
     error: float
 
     @classmethod
-    def fit(cls, states: Tensor, actions: Tensor, lengths: Tensor) -> Self:
-        """Fit to all transitions of demonstrations; every third of them measures error and ridge penalty of a fit to the others.
+    def fit(cls, inputs: Tensor, outputs: Tensor, rows: Tensor) -> Self:
+        """Fit to samples ``(sample, input)`` and ``(sample, output)`` of demonstrations ``rows (sample,)``.
 
-        Args:
-            states, actions: ``(demo, time, state)`` and ``(demo, time, action)``.
-            lengths: valid times of each demonstration ``(demo,)``.
+        Every third demonstration measures the error and the ridge penalty of a fit to the others.
         """
-        before = torch.arange(states.shape[1] - 1) < (lengths - 1)[:, None]  # (demo, time)
-        row = torch.arange(len(states))[:, None].expand_as(before)[before]
-        chosen = torch.randperm(len(row), generator=generator("cpu", 0))[:LARGEST_FIT]
-        first, second = states[:, :-1][before].double(), states[:, 1:][before].double()
-        inputs, outputs = torch.cat((first, second - first), dim=1)[chosen], actions[:, :-1][before].double()[chosen]
+        chosen = torch.randperm(len(rows), generator=generator("cpu", 0))[:LARGEST_FIT]
+        inputs, outputs, rows = inputs[chosen].double(), outputs[chosen].double(), rows[chosen]
         centre, scale = inputs.mean(dim=0), inputs.std(dim=0).clamp(min=1e-9)
-        weights = torch.randn(1 + inputs.shape[1], UNITS_HIDDEN, generator=generator("cpu", 1), dtype=torch.float64)
+        weights = torch.randn(1 + inputs.shape[1], HIDDEN, generator=generator("cpu", 1), dtype=torch.float64)
         weights[1:] /= inputs.shape[1] ** 0.5
         features = _features((inputs - centre) / scale, weights)
-        left = row[chosen] % 3 == 2 if len(states) > 2 else torch.arange(len(inputs)) % 3 == 2
+        left = rows % 3 == 2 if int(rows.max()) > 1 else torch.arange(len(inputs)) % 3 == 2
         variance = outputs.var(dim=0, correction=0).sum().clamp(min=1e-12)
         errors = {}
         for ridge in RIDGES:
@@ -91,11 +95,52 @@ class InverseModel:
         readout = _ridge(features, outputs, ridge)
         return cls(centre, scale, weights, readout, outputs.amin(dim=0), outputs.amax(dim=0), errors[ridge])
 
-    def __call__(self, states: Tensor, following: Tensor) -> Tensor:
-        """Actions ``(sample, action)`` that lead from ``states (sample, state)`` to ``following (sample, state)``."""
-        first, second = states.double(), following.double()
-        inputs = (torch.cat((first, second - first), dim=1) - self.centre) / self.scale
-        return (_features(inputs, self.weights) @ self.readout).clamp(self.low, self.high).float()
+    def __call__(self, inputs: Tensor) -> Tensor:
+        """Outputs ``(sample, output)`` of ``inputs (sample, input)``."""
+        features = _features((inputs.double() - self.centre) / self.scale, self.weights)
+        return (features @ self.readout).clamp(self.low, self.high).float()
+
+
+def inverse_model(states: Tensor, actions: Tensor, lengths: Tensor) -> Regression:
+    """Regression of actions on the present state and the step to the next ``(sample, 2 * state)``.
+
+    Args:
+        states, actions: ``(demo, time, state)`` and ``(demo, time, action)``.
+        lengths: valid times of each demonstration ``(demo,)``.
+    """
+    row, time = _times(lengths - 1)
+    first = states[row, time].double()
+    return Regression.fit(torch.cat((first, states[row, time + 1].double() - first), dim=1), actions[row, time], row)
+
+
+def follows_present(states: Tensor, actions: Tensor, lengths: Tensor, concepts: Sequence[str], observed: Tensor) -> bool:
+    """Whether actions follow from the present state much better than from the initial state and time, in most concepts.
+
+    Args:
+        states, actions: ``(demo, time, state)`` and ``(demo, time, action)``.
+        lengths: valid times of each demonstration ``(demo,)``.
+        concepts: concept of each demonstration.
+        observed: observed vectors ``(demo, time, size)``.
+    """
+    votes: list[bool] = []
+    for name in dict.fromkeys(concepts):
+        some = torch.tensor([index for index, text in enumerate(concepts) if text == name])
+        if len(votes) == MOST_CONCEPTS or len(some) < 3:
+            continue
+        row, time = _times(lengths[some])
+        known = torch.cat((states[some].double(), observed[some].double()), dim=2)
+        outputs = actions[some][row, time]
+        now = Regression.fit(known[row, time], outputs, row).error
+        first = Regression.fit(torch.cat((known[row, 0], time[:, None].double()), dim=1), outputs, row).error
+        votes.append(now + SLACK < FOLLOWS * first)
+    return sum(votes) * 2 > len(votes)
+
+
+def _times(lengths: Tensor) -> tuple[Tensor, Tensor]:
+    """Demonstration and time ``(sample,)`` of every state within lengths."""
+    valid = torch.arange(int(lengths.max())) < lengths[:, None]
+    row, time = valid.nonzero(as_tuple=True)
+    return row, time
 
 
 def _features(inputs: Tensor, weights: Tensor) -> Tensor:

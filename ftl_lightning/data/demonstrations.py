@@ -259,6 +259,11 @@ class Demonstrations(Shown):
             action_names=(),
         )
 
+    @property
+    def at_start(self) -> Self:
+        """Demonstrations whose observed features are known only at the first time."""
+        return replace(self, observed=self.initial_states.observed, per_step=())
+
     def columns(self, chosen: Sequence[int]) -> Self:
         """Select columns of the states by their numbers from 0, in this order."""
         return replace(

@@ -1,6 +1,8 @@
 """Observed features that are places: positions in the space in which a plan moves, such as its start, an object, a goal."""
 
-from collections.abc import Mapping
+import itertools
+import re
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Self
 
@@ -11,7 +13,7 @@ from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import Observed
 
 Places = Mapping[str, tuple[int, ...]]
-"""Columns of the state in the same frame as an observed vector, by the name of the feature."""
+"""Columns of the state in the same frame as an observed vector, by the name of the feature, or of a part of it: ``goals[2:4]``."""
 
 EQUAL = 1e-4
 """Maximum difference of the initial state from a feature that equals it, relative to the columns' range."""
@@ -21,8 +23,30 @@ RIDGE, WINDOW = 0.01, 0.05
 """Ridge penalty of the shares with which paths follow places, relative to the places' mean square; half width of the window of
 times that share an estimate, as a share of the horizon.
 """
+ALIKE = 2.0
+"""Maximum ratio of the standard deviations of two places of a kind, and distance of their means in standard deviations."""
+MOST_ALIKE = 4
+"""Maximum number of places of a kind whose exchange is a prior."""
 PRIOR = 0.01
 """Ridge penalty of the weights of known frames, relative to the mean square of what they explain."""
+
+
+_PART = re.compile(r"(.+)\[(\d+):(\d+)\]")
+
+
+def feature_of(name: str, features: Mapping[str, object]) -> str:
+    """Name of the feature that a place, or the feature of which it is a part."""
+    part = None if name in features else _PART.fullmatch(name)
+    return part[1] if part else name
+
+
+def place_of(observed: Observed, name: str) -> Tensor:
+    """Values of a place ``(sample, size)``."""
+    whole = feature_of(name, observed)
+    if whole == name:
+        return observed[name].flatten(1)
+    first, last = map(int, name[len(whole) + 1 : -1].split(":"))
+    return observed[whole].flatten(1)[:, first:last]
 
 
 def first_windows(demonstrations: Demonstrations, horizon: int) -> Tensor:
@@ -67,20 +91,77 @@ def places(demonstrations: Demonstrations, horizon: int) -> Places:
     paths, texts = first_windows(demonstrations, horizon), demonstrations.concepts
     rows = [[row for row, text in enumerate(texts) if text == name] for name in dict.fromkeys(texts)]
     found: dict[str, tuple[int, ...]] = dict(starts(demonstrations))
-    for name, values in vectors_of(demonstrations).items():
-        best = {}
-        for columns in _windows(values.shape[1], demonstrations.state_units, paths.shape[2]):
-            shares = [
-                ((paths[some][..., list(columns)] - values[some][:, None]).var(dim=0) / values[some].var(dim=0).clamp(min=1e-12))
-                .amax(dim=1)
-                .min()
-                for some in rows
-                if len(some) > 2
-            ]
-            best[columns] = float(min(shares, default=torch.tensor(torch.inf)))
-        if name not in found and best and min(best.values()) <= FOLLOWED:
-            found[name] = min(best, key=lambda columns: best[columns])
+    begin, width = set(found), paths.shape[2]
+    vectors = vectors_of(demonstrations)
+
+    def best(values: Tensor) -> tuple[float, tuple[int, ...]]:
+        """Least share of the variance beside the place that remains, and the columns."""
+        shares = {
+            columns: min(
+                (
+                    float((rest.var(dim=0) / values[some].var(dim=0).clamp(min=1e-12)).amax(dim=1).min())
+                    for some in rows
+                    if len(some) > 2
+                    for rest in [paths[some][..., list(columns)] - values[some][:, None]]
+                ),
+                default=float("inf"),
+            )
+            for columns in _windows(values.shape[1], demonstrations.state_units, width)
+        }
+        return min(((share, columns) for columns, share in shares.items()), default=(float("inf"), ()))
+
+    parts: dict[str, Tensor] = {}
+    for name, values in vectors.items():
+        if name in found:
+            continue
+        for each in _parts(name, values, width):
+            followed = {part: columns for part, value in each.items() for share, columns in [best(value)] if share <= FOLLOWED}
+            if followed:
+                found |= followed
+                parts |= each
+                break
+        else:
+            parts |= {name: values} if values.shape[1] <= width else {}
+    for name, values in parts.items():
+        kin = [other for other in found if other not in begin and _alike(values, parts[other])] if name not in found else []
+        if kin:
+            found[name] = found[kin[0]]
     return found
+
+
+def _parts(name: str, values: Tensor, width: int) -> Iterator[dict[str, Tensor]]:
+    """Ways to divide a vector ``(demo, size)`` into places of at most ``width`` numbers, the largest first."""
+    size = values.shape[1]
+    for each in range(min(size, width), 1 if size > width else size - 1, -1):
+        if size % each == 0:
+            starts = range(0, size, each)
+            yield {name if each == size else f"{name}[{first}:{first + each}]": values[:, first : first + each] for first in starts}
+
+
+def _alike(values: Tensor, others: Tensor) -> bool:
+    """Whether two features may be places of a kind, such as two goals: as many numbers, in the same range."""
+    if values.shape != others.shape:
+        return False
+    first, second = values.std(dim=0).clamp(min=1e-9), others.std(dim=0).clamp(min=1e-9)
+    near = (values.mean(dim=0) - others.mean(dim=0)).abs() <= ALIKE * torch.minimum(first, second)
+    return bool((near & (first <= ALIKE * second) & (second <= ALIKE * first)).all())
+
+
+def _exchanged(prior: Tensor, columns: list[tuple[int, ...]]) -> Tensor:
+    """Frames ``(frame, place, time)`` with those whose places of a kind are exchanged: what training concepts do with one goal, a
+    new concept may do with another. The place where paths begin is no goal.
+    """
+    later = [number for number in range(len(columns)) if float(prior[:, number, 0].abs().mean()) < 0.5]
+    kinds = [[number for number in later if columns[number] == kind] for kind in dict.fromkeys(columns[number] for number in later)]
+    orders = [list(range(len(columns)))]
+    for kind in kinds:
+        if 1 < len(kind) <= MOST_ALIKE:
+            orders = [
+                [mixed.get(number, order[number]) for number in range(len(order))]
+                for order in orders
+                for mixed in (dict(zip(kind, (order[n] for n in several), strict=True)) for several in itertools.permutations(kind))
+            ]
+    return torch.cat([prior[:, order] for order in orders]) if len(orders) > 1 else prior
 
 
 @dataclass(frozen=True)
@@ -105,17 +186,18 @@ class Frames:
         With a ``prior``, shares ``(frame, place, time)`` of several concepts, the ridge regression starts at the weighted sum of
         the prior's shares that explains the paths best, and not at 0. A single path has their mean.
         """
-        named = {name: columns for name, columns in known.items() if name in observed}
+        named = {name: columns for name, columns in known.items() if feature_of(name, observed) in observed}
         count, horizon, width = paths.shape
         if prior is not None and count < 2:
             return cls(named, prior.mean(dim=0))
+        prior = prior if prior is None or prior.shape[1] != len(named) else _exchanged(prior, list(named.values()))
         if not named or count < 2:
             return cls({}, paths.new_zeros(0, horizon))
         spread = (paths - paths.mean(dim=0)).square().mean(dim=(0, 1)).sqrt()
         scale = torch.where(spread > 0, spread, torch.inf)
         moved = paths.new_zeros(len(named), count, width)
         for number, (name, columns) in enumerate(named.items()):
-            values = observed[name].flatten(1).to(paths)
+            values = place_of(observed, name).to(paths)
             moved[number][:, list(columns)] = values - values.mean(dim=0)
         regressors = (moved / scale).flatten(1)  # (place, demo * state)
         targets = ((paths - paths.mean(dim=0)) / scale).transpose(0, 1).flatten(1)  # (time, demo * state)
@@ -144,7 +226,7 @@ def shift(shares: Tensor, places: Places, observed: Observed, width: int) -> Ten
     """What places add to paths ``(sample, time, width)``, by shares ``(sample, place, time)`` or ``(1, place, time)``."""
     total = shares.new_zeros(1, shares.shape[2], width)
     for number, (name, columns) in enumerate(places.items()):
-        values = observed[name].flatten(1).to(shares)
+        values = place_of(observed, name).to(shares)
         added = shares.new_zeros(len(values), shares.shape[2], width)
         added[..., list(columns)] = shares[:, number, :, None] * values[:, None]
         total = total + added

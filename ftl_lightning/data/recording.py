@@ -89,7 +89,8 @@ def _is_vector(space: gymnasium.Space[Any]) -> bool:
 class Recorder(gymnasium.Wrapper[Any, Any, Any, Any]):
     """Record every episode of an environment as a demonstration, whoever acts in it: a person, a script or a policy.
 
-    An episode of n steps has n + 1 states; the last action, if actions are vectors, is repeated in the last state. It ends when the environment terminates or truncates it; later steps are not recorded.
+    An episode of n steps has n + 1 states; the last action, if actions are vectors, is repeated in the last state. It ends
+    when the environment terminates or truncates it; later steps are not recorded.
     The wrapper does not change the environment's behaviour.
 
     Args:

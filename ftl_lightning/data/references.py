@@ -10,7 +10,7 @@ from torch import Tensor
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import Observed
 from ftl_lightning.data.pinned import Pinned
-from ftl_lightning.data.places import Frames, Places, first_windows, frames_of, places, starts, vectors_of
+from ftl_lightning.data.places import Frames, Places, feature_of, first_windows, frames_of, place_of, places, starts, vectors_of
 from ftl_lightning.services.errors import require, short
 from ftl_lightning.services.validation import check_range, from_mapping
 
@@ -223,7 +223,8 @@ class Reference:
             require(values.dtype in (torch.float32, torch.float64), f"{place}: {short(name)}", "float32 or float64", values.dtype)
         known = {**contents.places, **contents.starts}
         for key, columns in known.items():
-            fits = key in observed and len(columns) == observed[key].shape[1] and all(0 <= c < paths.shape[2] for c in columns)
+            fits = feature_of(key, observed) in observed and len(columns) == place_of(observed, key).shape[1]
+            fits = fits and all(0 <= column < paths.shape[2] for column in columns)
             require(fits, f"{place}: places", "columns of the state for each number of an observed feature", short(key))
         shape, frames = (len(contents.places), paths.shape[1]), tensors["frames"]
         fits = frames.dim() == 3 and len(frames) > 0 and frames.shape[1:] == shape

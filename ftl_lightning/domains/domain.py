@@ -13,7 +13,6 @@ from typing import Any, Literal, Protocol, Self, runtime_checkable
 import torch
 from torch import Tensor
 
-from ftl_lightning.data.actions import action_columns
 from ftl_lightning.data.columns import aligned
 from ftl_lightning.data.demonstrations import Demonstrations, padded
 from ftl_lightning.data.distances import Distance
@@ -321,8 +320,6 @@ class Domain(Shown):
         """
         wanted = f"behaviour of {self.name}, the model's domain"
         require(demonstrations.domain in (self.name, ""), place, wanted, f"that of {short(demonstrations.domain)}")
-        if action_columns(self.plans.columns) and demonstrations.actions is not None:
-            demonstrations = demonstrations.joined
         expected, columns = len(self.plans.columns), demonstrations.states.shape[2]
         advice = "; exchange axes 1 and 2" if demonstrations.states.shape[1] == expected else ""
         require(columns == expected, place, f"states of {expected} columns ({self.name})", f"{columns}{advice}")

@@ -32,11 +32,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ftl_lightning.data.actions import PRESENT, action_columns, follows_present
 from ftl_lightning.data.columns import check_precision
 from ftl_lightning.data.demonstrations import Demonstrations, held, in_sequence
 from ftl_lightning.data.distances import warped_distances
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.data.kinds import LINEAR, Columns, check_values, declared, resolved
+from ftl_lightning.data.places import places
 from ftl_lightning.domains.comparison import Comparison
 from ftl_lightning.domains.domain import OWN, Concepts, Domain, Metric, Plans, Recordings, Split, View
 from ftl_lightning.domains.recognition import Recognition
@@ -79,6 +81,8 @@ class FileSource:
 
 HELD_OUT = 3
 """Seed of the demonstrations that are held out."""
+ACTED, LEAST_WINDOWS = 32, 2
+"""Length of windows of demonstrations whose actions follow the present state, and least number of such windows in the longest."""
 LONGEST_PLAN, WINDOW = 1024, 256
 """Maximum length of demonstrations that are learned whole by default, and the default length of windows of longer ones."""
 
@@ -95,7 +99,9 @@ class OwnDomain(Domain):
         Raises:
             UserError: also for other kinds, values that contradict a kind, and columns whose steps float32 cannot hold.
         """
-        fitted = super().fitted(replace(demonstrations, domain=self.name), place)
+        acted = demonstrations.joined if action_columns(self.plans.columns) else demonstrations
+        acted = with_present(acted) if PRESENT in self.observed else acted
+        fitted = super().fitted(replace(acted, domain=self.name), place)
         kinds = self.plans.kinds or (LINEAR,) * len(self.plans.columns)
         words = [[text.partition(" ")[0] for text in texts] for texts in (fitted.state_kinds or kinds, kinds)]
         wanted = f"{short(', '.join(words[1]), 100)}, the model's"
@@ -169,6 +175,27 @@ def own_domain(
     )
 
 
+def with_present(demonstrations: Demonstrations) -> Demonstrations:
+    """Demonstrations that observe the present state, without its actions, at every time."""
+    acts = action_columns(demonstrations.state_names)
+    states = demonstrations.states[..., [column for column in range(demonstrations.states.shape[2]) if column not in acts]]
+    observed = {**demonstrations.observed, PRESENT: states.float()}
+    return replace(demonstrations, observed=observed, per_step=(*demonstrations.per_step, PRESENT))
+
+
+def _follows(demonstrations: Demonstrations, acts: list[int]) -> bool:
+    """Whether actions follow the present state, see :func:`~ftl_lightning.data.actions.follows_present`."""
+    rest = [column for column in range(demonstrations.states.shape[2]) if column not in acts]
+    states, time = demonstrations.states, demonstrations.states.shape[1]
+    timed = [
+        values.flatten(2) if name in demonstrations.per_step else values.flatten(1)[:, None].expand(-1, time, -1)
+        for name, values in demonstrations.observed.items()
+        if values.dtype != torch.uint8
+    ]
+    observed = torch.cat(timed, dim=2) if timed else states.new_zeros(len(states), time, 0)
+    return follows_present(states[..., rest], states[..., acts], demonstrations.lengths, demonstrations.concepts, observed)
+
+
 def uncalibrated(examples: Demonstrations, training: Sequence[str]) -> str:
     """Why the metric recognised is not shown; empty if every training concept has enough held-out demonstrations."""
     counts = {name: examples.concepts.count(name) for name in training}
@@ -200,7 +227,8 @@ def domain_from_file(
     Args:
         path: the file, the folder of a LeRobot data set, or the name of an installed Minari data set.
         horizon: states in a plan; ``None`` for the length of the longest demonstration, or :data:`WINDOW` if it is longer than
-            :data:`LONGEST_PLAN`.
+            :data:`LONGEST_PLAN`. If plans are whole demonstrations and follow observed places, only features at the first time are
+            used.
         metrics: see :func:`own_domain`.
         share: share of each concept's demonstrations to hold out at random, at least a single demonstration.
         kinds: kinds of columns by name, see :func:`~ftl_lightning.data.kinds.declared`.
@@ -219,9 +247,18 @@ def domain_from_file(
         require(len(rows) >= 2, f"{path}: concept {text!r}", "two demonstrations or more (one is held out)", len(rows))
         mixed = torch.randperm(len(rows), generator=generator("cpu", task_key(text), HELD_OUT))
         held_out[torch.tensor(rows)[mixed[: max(1, math.floor(share * len(rows)))]]] = True
-    source = FileSource(demonstrations, held_out)
     longest = int(demonstrations.lengths.max())
     usual = longest if longest <= LONGEST_PLAN else WINDOW
+    acts = list(action_columns(demonstrations.state_names))
+    followed = places(demonstrations, longest)
+    if acts and horizon is None and not followed and longest > LEAST_WINDOWS * ACTED and _follows(demonstrations, acts):
+        horizon, whole = ACTED, f"--data.horizon {longest} makes them whole"
+        note(f"data.horizon: actions follow the present state, so plans are windows of {horizon}; {whole}")
+    if acts and horizon is not None and horizon < longest:
+        demonstrations = with_present(demonstrations)
+    if demonstrations.per_step and longest <= (horizon or usual) and followed:
+        demonstrations = demonstrations.at_start
+    source = FileSource(demonstrations, held_out)
     return own_domain(source.split("validation", 0, 0), tuple(rows_of), horizon or usual, metrics, source)
 
 

@@ -1,6 +1,6 @@
 """Receding-horizon policies: plans of a concept, executed in a domain's environment or in one's own."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import Any, Protocol
 
 import numpy as np
@@ -8,7 +8,8 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from ftl_lightning.data.actions import InverseModel, action_columns
+from ftl_lightning.data.actions import PRESENT, action_columns, inverse_model
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import PINNED, Observed, moved
 from ftl_lightning.data.pinned import Pinned
 from ftl_lightning.domains.domain import closed_loop_of
@@ -71,7 +72,7 @@ class Acting:
             examples = model.examples
             assert examples is not None
             states, actions = examples.states[..., self.states], examples.states[..., self.actions]
-            inverse = InverseModel.fit(states, actions, examples.lengths)
+            inverse = inverse_model(states, actions, examples.lengths)
             self._inverse = inverse if inverse.error <= EXPLAINED else None
             source = "actions by an inverse model from the next planned state" if self._inverse else "actions as planned"
             self.words = f"{source}; such a model explains {max(1 - inverse.error, 0):.0%} of the variance of actions"
@@ -82,91 +83,73 @@ class Acting:
         if self._control is not None:
             return torch.as_tensor(np.asarray(self._control(present.numpy(), following.numpy()), dtype=np.float32))
         if self._inverse is not None:
-            return self._inverse(present, following)
+            return self._inverse(torch.cat((present.double(), following.double() - present.double()), dim=1))
         return plans[:, min(age, plans.shape[1] - 1), self.actions] if self.actions else following
 
 
-class WholePlans:
-    """Follow plans of whole behaviour, which are corrected to the present state every few steps.
+class Plans:
+    """Follow plans of a user's data, which are sampled again every few steps, with the same noise in an episode.
 
-    A plan begins where the episode does, with what is observed there. A correction moves the plan so that it passes the present
-    state, and fades, see :class:`~ftl_lightning.data.pinned.Pinned`. At its end a plan is held if demonstrations end at rest;
-    otherwise another one begins.
+    Plans as long as demonstrations begin where the episode does, with what is observed there, and pass the present state. At its
+    end such a plan is held if demonstrations end at rest; otherwise another one begins. Shorter plans begin at the present state,
+    with what is observed now.
 
     Args:
         model: model of a user's data.
-        compositions: ``(batch size) -> composition of each episode``.
+        concept: composition.
         seed: seed of the noise; each episode has a generator.
         sampling: sampler, steps and temperature.
         acting: see :class:`Acting`.
-        execute: steps between corrections.
-        replan: steps after which plans are sampled again, through the present state; ``None`` for never.
+        execute: number of steps between plans.
     """
 
     def __init__(
-        self,
-        model: ConceptModel,
-        concept: Composition,
-        seed: int,
-        sampling: Sampling,
-        acting: Acting,
-        execute: int,
-        replan: int | None,
+        self, model: ConceptModel, concept: Composition, seed: int, sampling: Sampling, acting: Acting, execute: int
     ) -> None:
         self._model, self._concept, self._seed, self._sampling = model, concept, seed, sampling
-        self._acting, self._execute, self._replan = acting, execute, replan
+        self._acting, self._execute = acting, execute
         self._first: dict[int, dict[str, Tensor]] = {}
         self._begun = 0
         self.followed: dict[int, list[Tensor]] = {}
-        self._rests = _ends_at_rest(model)
+        examples = model.examples
+        assert examples is not None
+        self._whole = int(examples.lengths.max()) <= model.horizon
+        self._rests = self._whole and _ends_at_rest(examples)
 
     def __call__(self, observed: Observed, rows: list[int], step: int) -> Tensor:
-        if step == 0 or (step - self._begun >= self._model.horizon - 1 and not self._rests):
+        last = self._model.horizon - 1
+        begins = step - self._begun >= last and not self._rests if self._whole else step % self._execute == 0
+        if step == 0 or begins:
             self._begun = step
             self._first |= {row: {name: values[index] for name, values in observed.items()} for index, row in enumerate(rows)}
         age, present = step - self._begun, observed[STATE]
-        if age == 0 or (self._replan and age % self._replan == 0 and age < self._model.horizon - 1):
+        if age == 0 or (age % self._execute == 0 and age < last):
             plans = self._sampled(rows, present, age)
         else:
             plans = torch.stack([self.followed[row][-1] for row in rows])
-            if age % self._execute == 0 and age < self._model.horizon:
-                plans = self._corrected(plans, rows, present, age)
         for row, plan in zip(rows, plans, strict=True):
             self.followed.setdefault(row, []).append(plan)
         return self._acting(present, plans, age)
 
     def _sampled(self, rows: list[int], present: Tensor, age: int) -> Tensor:
-        """Plans that pass the present state at a time (``age``); the same noise for every plan of an episode."""
+        """Plans ``(episode, horizon, state)`` that pass the present state at a time (``age``)."""
+        model, device = self._model, self._model.device
         draws = [generator("cpu", self._seed, 1, row) for row in rows]
-        features = self._features(rows)
-        if self._model.max_steps is not None:
-            features[PINNED] = self._known(present, age)
-        device = self._model.device
-        parts = [self._concept.drawn(draw) for draw in draws]
-        plans = self._model.sample(parts, 1, self._sampling, draws, moved(features, device))[:, 0].cpu()
-        return plans if self._model.max_steps is not None else self._corrected(plans, rows, present, age)
-
-    def _features(self, rows: list[int]) -> dict[str, Tensor]:
-        return {name: torch.stack([self._first[row][name] for row in rows]) for name in self._model.domain.observed}
-
-    def _known(self, present: Tensor, age: int) -> Tensor:
-        known = torch.full((len(present), self._model.horizon, len(self._model.domain.plans.columns)), torch.nan)
+        features = {name: torch.stack([self._first[row][name] for row in rows]) for name in model.domain.observed}
+        known = torch.full((len(rows), model.horizon, len(model.domain.plans.columns)), torch.nan)
         known[:, age, self._acting.states] = present.float()
-        return known
+        pinned = features if model.max_steps is None else {**features, PINNED: known}
+        parts = [self._concept.drawn(draw) for draw in draws]
+        plans = model.sample(parts, 1, self._sampling, draws, moved(pinned, device))[:, 0]
+        if model.max_steps is None:  # a method whose samples are not pinned
+            values, before = (model.encode(states.to(device), moved(features, device)) for states in (known, plans))
+            mask = ~values.isnan() & (torch.arange(model.horizon, device=device) == age)[:, None]
+            plans = model.decode(Pinned(mask, values.nan_to_num())(before), moved(features, device))
+        return plans.cpu()
 
-    def _corrected(self, plans: Tensor, rows: list[int], present: Tensor, age: int) -> Tensor:
-        features = self._features(rows)
-        model = self._model
-        values, before = (model.encode(states.to(model.device), features).cpu() for states in (self._known(present, age), plans))
-        mask = ~values.isnan()
-        mask[:, torch.arange(mask.shape[1]) != age] = False  # constant columns are known at every time
-        return model.decode(Pinned(mask, values.nan_to_num())(before).to(model.device), features).cpu()
 
-
-def _ends_at_rest(model: ConceptModel) -> bool:
-    """Whether most demonstrations of a user's data end at rest."""
-    examples = model.examples
-    assert examples is not None
+def _ends_at_rest(examples: Demonstrations) -> bool:
+    """Whether most demonstrations end at rest."""
     ends = []
     for path, length in zip(examples.states, examples.lengths.tolist(), strict=True):
         steps = path[:length].diff(dim=0).norm(dim=1)
@@ -187,13 +170,12 @@ class Policy(Shown):
         concept: Composition,
         sampling: Sampling,
         execute: int,
-        replan: int | None = None,
         act: Control | None = None,
         observe: Callable[[Any], Any] | None = None,
         seed: int = 0,
     ) -> None:
         self.model, self.concept, self.execute = model, concept, execute
-        self._sampling, self._replan, self._observe, self._seed = sampling, replan, observe, seed
+        self._sampling, self._observe, self._seed = sampling, observe, seed
         # A user's data have examples and no environment.
         self._acting = Acting(model, act) if model.domain.closed_loop is None and model.examples is not None else None
         if self._acting is None:
@@ -205,17 +187,16 @@ class Policy(Shown):
 
     def _words(self) -> Iterator[str]:
         yield repr(self.model.domain.name)
-        yield f"{counted(self.execute, 'step')} of each plan"
+        yield f"a plan every {counted(self.execute, 'step')}"
         yield self.words
 
     def following(self, count: int, seed: int) -> Follower:
         """Policy of ``count`` episodes in lockstep, whose noise depends on seed and episode."""
         if self._acting is not None:
-            settings = (self._sampling, self._acting, self.execute, self._replan)
-            return WholePlans(self.model, self.concept, seed, *settings)
+            return Plans(self.model, self.concept, seed, self._sampling, self._acting, self.execute)
         draws = [generator("cpu", seed, 1, episode) for episode in range(count)]
         make = sampled_plans(self.model, [self.concept] * count, self._sampling, draws)
-        return PlanFollower(make, planner(self.model, closed_loop_of(self.model.domain)), self._replan or self.execute)
+        return PlanFollower(make, planner(self.model, closed_loop_of(self.model.domain)), self.execute)
 
     def reset(self, seed: int | None = None) -> None:
         """Begin new episodes; ``seed`` is that of the noise, the last one if ``None``."""
@@ -263,7 +244,7 @@ class Policy(Shown):
             require(isinstance(given, Mapping), "observation", f"a dictionary of {', '.join(features)}", type(given).__name__)
             return _by_shape({name: given.get(name) for name in features}, shapes)
         shapes[STATE] = (len(self._acting.states),)
-        starts = self.model.starts
+        starts = {*self.model.starts, PRESENT}
         if isinstance(given, Mapping):
             values = {name: given[name] for name in features if name in given}
             vectors = [key for key in NAMES if key in given and key not in features]
@@ -272,13 +253,15 @@ class Policy(Shown):
                 values[STATE] = given[vectors[0]]
         else:
             values = _of_vector(_numbers("observation", given), shapes, starts)
-        for name, columns in starts.items():
+        if PRESENT in features and STATE in values:
+            values[PRESENT] = values[STATE]
+        for name, columns in self.model.starts.items():
             if name not in values and STATE in values:
                 values[name] = _numbers("state", values[STATE])[..., [self._acting.states.index(column) for column in columns]]
         return _by_shape({name: values.get(name) for name in shapes}, shapes)
 
 
-def _of_vector(vector: Tensor, shapes: Mapping[str, tuple[int, ...]], starts: Mapping[str, Any]) -> dict[str, Any]:
+def _of_vector(vector: Tensor, shapes: Mapping[str, tuple[int, ...]], starts: Collection[str]) -> dict[str, Any]:
     """Parts of a vector ``(..., size)``: the state, then observed features in order, without those that equal the first state."""
     parts = {STATE: shapes[STATE], **{name: shape for name, shape in shapes.items() if name != STATE and name not in starts}}
     sizes = [int(np.prod(shape)) for shape in parts.values()]

@@ -374,7 +374,7 @@ class FewShot(Shown):
         title = f"learning {names[0]!r}" if len(names) == 1 else f"learning {len(names)} concepts"
         check_whole("seed", seed, 0, None)
         chosen = changed(call, self.tuned.inversion, changes, ("steps", "seed", "progress", "watch"), INVERSION)
-        settings = replace(chosen, seed=int(seed)).for_own(bool(self.model.adaptable()) and not {"modes", "adapter"} & {*changes})
+        settings = replace(chosen, seed=int(seed)).for_own(self.model.chooses_form and not {"modes", "adapter"} & {*changes})
         given = next(iter([*changes, *([] if watch is None else ["watch"])]), None)
         descends = self.model.invertible or given is None
         method = self.model.method.name
@@ -565,14 +565,12 @@ class FewShot(Shown):
     ) -> Policy:
         """Make a receding-horizon policy of a concept, for one environment or a batch of them.
 
-        With a user's data, a plan is sampled where an episode begins and corrected to the present state every ``execute`` steps.
-        With a domain that has an environment, a plan is sampled every ``execute`` steps.
+        With a user's data, plans are whole behaviour, from where an episode begins and through the present state.
 
         Args:
             concept: as in :meth:`sample`.
-            execute: number of steps of a plan before it is corrected or replaced.
-            replan: number of steps after which a plan is sampled again, through the present state; ``None`` for never with a
-                user's data, for ``execute`` with other domains.
+            execute: number of steps of a plan that are executed (an action chunk).
+            replan: steps between plans; ``None`` for ``execute``.
             act: with a user's data, controller ``(present states (episode, state), next planned states) -> actions``, arrays;
                 ``None`` for the actions of the data: by an inverse model if it explains them, else as planned. The policy's text
                 says which.
@@ -585,9 +583,8 @@ class FewShot(Shown):
             UserError: for a concept of another model, or a domain with neither an environment nor a user's data.
         """
         concept, sampling = self._own("policy", concept), self._sampling("policy", changes)
-        execute, seed = check_whole("execute", execute, 1), check_whole("seed", seed, 0, None)
-        replan = None if replan is None else check_whole("replan", replan, 1)
-        return Policy(self.model, concept, sampling, execute, replan, act, observe, seed)
+        every = check_whole("execute", execute, 1) if replan is None else check_whole("replan", replan, 1)
+        return Policy(self.model, concept, sampling, every, act, observe, check_whole("seed", seed, 0, None))
 
     @usual_modes()
     def rollout(

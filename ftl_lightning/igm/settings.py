@@ -256,7 +256,7 @@ class InversionSettings:
         """Settings for a user's demonstrations: the form is ``'auto'`` unless form, modes or adapter are given.
 
         Args:
-            choose: whether the form may be chosen; requires a model with adapters.
+            choose: whether the form may be chosen; see ``chooses_form`` of the model.
         """
         unsaid = self.form == UNSAID and self.modes.sets == 1 and not self.adapter.rank
         return replace(self, form=AUTO) if unsaid and choose else self

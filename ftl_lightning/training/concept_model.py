@@ -10,10 +10,11 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
+from ftl_lightning.data.actions import PRESENT
 from ftl_lightning.data.deformation import Deformations
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import PINNED, READ, Feature, Observed, check_features, moved
-from ftl_lightning.data.places import Places, first_windows, frames_of, shift, starts
+from ftl_lightning.data.places import Places, feature_of, first_windows, frames_of, shift, starts
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import EMPTY_CONCEPT, TRAINING_CONCEPT, Concept, Origin, Point
 from ftl_lightning.igm.forms.adapter import LowRank
@@ -254,6 +255,11 @@ class ConceptModel(Shown, nn.Module, ABC):
         return False
 
     @property
+    def chooses_form(self) -> bool:
+        """Whether the form of a concept of a user's data may be chosen by samples of whole behaviour."""
+        return bool(self.adaptable()) and PRESENT not in self.domain.observed
+
+    @property
     def horizon(self) -> int:
         """Number of states in a plan."""
         return self.config.horizon
@@ -351,7 +357,10 @@ class ConceptModel(Shown, nn.Module, ABC):
         ``frames``, shares ``(sample, place, horizon)`` or ``(1, place, horizon)``, subtract what observed places explain.
         """
         if frames is not None:
-            check_features(observed, {name: self.domain.observed[name] for name in self.config.places})
+            features = self.domain.observed
+            check_features(
+                observed, {name: features[name] for name in (feature_of(place, features) for place in self.config.places)}
+            )
             states = states - shift(frames, self.config.places, observed, states.shape[2])
         if self.view is not None:
             states = self.view.encode(states, observed)

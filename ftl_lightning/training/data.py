@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset
 
+from ftl_lightning.data.actions import PRESENT
 from ftl_lightning.data.check import check_each
 from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.data.features import check_features
@@ -293,7 +294,8 @@ class OwnData(PretrainingData):
         self.metrics = self._metrics
         source = self.domain.source(None)
         assert isinstance(source, FileSource)
-        if horizon is None and self.horizon < (longest := int(source.demonstrations.lengths.max())):
+        longest = int(source.demonstrations.lengths.max())
+        if horizon is None and self.horizon < longest and PRESENT not in self.domain.observed:
             text = f"demonstrations have up to {longest} steps, so plans are windows of {self.horizon}"
             note(f"data.horizon: {text}; --data.horizon N makes them longer or shorter")
         for text in alike(self.domain.concepts.training):

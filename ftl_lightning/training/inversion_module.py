@@ -87,7 +87,7 @@ class InversionModule(Adaptation):
             with torch.device("cpu"):  # with the demonstrations; Lightning moves the parameters afterwards
                 super().configure_model()
                 if self._of_user:
-                    self.settings = self.settings.for_own(bool(self.model.adaptable()))
+                    self.settings = self.settings.for_own(self.model.chooses_form)
                 self.inversion = Inversion(self.model, self.demonstrations, first_settings(self.settings))
 
     def learn(self) -> dict[str, Concept]:

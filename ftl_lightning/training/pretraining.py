@@ -20,7 +20,7 @@ from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import Feature, Observed
 from ftl_lightning.data.kinds import LINEAR
 from ftl_lightning.data.normalization import Normalization
-from ftl_lightning.data.places import frames_of, places, shift
+from ftl_lightning.data.places import feature_of, frames_of, places, shift
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.tasks import WITHOUT_WEIGHT, EvaluationTask
 from ftl_lightning.igm.composition import Composition
@@ -175,7 +175,8 @@ class Pretraining(pl.LightningModule, ABC, Generic[M]):
         name, known = self.hparams["view"] or data.view, self._places(data)
         view = find_view(data.domain, name)
         features = data.domain.observed if view is None else view.features
-        features = {name: feature for name, feature in features.items() if name not in known}  # frames see places, networks do not
+        placed = {feature_of(place, features) for place in known}  # frames see places, networks do not
+        features = {name: feature for name, feature in features.items() if name not in placed}
         observed: Observed
         frames = None
         if known:

@@ -152,7 +152,10 @@ def _raw(dataset: Any, folder: Path) -> Iterator[Iterator[_Raw]]:
     if dataset.storage.FORMAT != "hdf5":
         _check_tables(dataset, folder)
         rows = zip(dataset, dataset.storage.get_episode_metadata(dataset.episode_indices), strict=True)
-        yield (_Raw(partial(part_of, episode.observations), episode.actions, episode.infos or {}, metadata) for episode, metadata in rows)
+        yield (
+            _Raw(partial(part_of, episode.observations), episode.actions, episode.infos or {}, metadata)
+            for episode, metadata in rows
+        )
         return
     from ftl_lightning.data.formats.hdf5_file import opened
 
