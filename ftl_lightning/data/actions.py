@@ -13,16 +13,24 @@ ACTION = "action"
 """First word of the names of columns of actions, where they are joined to the columns of states."""
 PRESENT = "present state"
 """Observed feature that is added to demonstrations with actions: the state from which a window begins."""
-HIDDEN, RIDGES = 256, (1e-8, 1e-5, 1e-2)
-"""Number of random features of a regression, and ridge penalties to choose from."""
-LARGEST_FIT = 5_000
-"""Maximum number of samples that a regression is fitted to."""
+CONTEXT = "context "
+"""Beginning of the name of the observed feature that holds columns which do not change in a demonstration, such as goals; their
+names follow, separated by commas.
+"""
+STILL = 1e-5
+"""Maximum range of a column that does not change in a demonstration, relative to its range over all."""
+RIDGES = 1e-8, 1e-5, 1e-2
+"""Ridge penalties to choose from."""
+HIDDEN, LARGEST_FIT = 512, 20_000
+"""Number of random features of an inverse model, and maximum number of transitions that it is fitted to."""
+QUICK_HIDDEN, QUICK_FIT = 128, 3_000
+"""The same of regressions that show what actions follow."""
 FOLLOWS = 0.5
 """Maximum error of actions that are predicted from the present state, relative to those predicted from the initial state and time,
 for plans to begin at the present state."""
 SLACK = 0.05
 """Error that is no reason to choose, as a share of the variance of actions."""
-MOST_CONCEPTS = 8
+MOST_CONCEPTS = 4
 """Number of concepts that are examined."""
 
 
@@ -74,15 +82,16 @@ class Regression:
     error: float
 
     @classmethod
-    def fit(cls, inputs: Tensor, outputs: Tensor, rows: Tensor) -> Self:
+    def fit(cls, inputs: Tensor, outputs: Tensor, rows: Tensor, hidden: int, most: int) -> Self:
         """Fit to samples ``(sample, input)`` and ``(sample, output)`` of demonstrations ``rows (sample,)``.
 
-        Every third demonstration measures the error and the ridge penalty of a fit to the others.
+        At most ``most`` samples are used, with ``hidden`` random features. Every third demonstration measures the error and the
+        ridge penalty of a fit to the others.
         """
-        chosen = torch.randperm(len(rows), generator=generator("cpu", 0))[:LARGEST_FIT]
+        chosen = torch.randperm(len(rows), generator=generator("cpu", 0))[:most]
         inputs, outputs, rows = inputs[chosen].double(), outputs[chosen].double(), rows[chosen]
         centre, scale = inputs.mean(dim=0), inputs.std(dim=0).clamp(min=1e-9)
-        weights = torch.randn(1 + inputs.shape[1], HIDDEN, generator=generator("cpu", 1), dtype=torch.float64)
+        weights = torch.randn(1 + inputs.shape[1], hidden, generator=generator("cpu", 1), dtype=torch.float64)
         weights[1:] /= inputs.shape[1] ** 0.5
         features = _features((inputs - centre) / scale, weights)
         left = rows % 3 == 2 if int(rows.max()) > 1 else torch.arange(len(inputs)) % 3 == 2
@@ -110,7 +119,8 @@ def inverse_model(states: Tensor, actions: Tensor, lengths: Tensor) -> Regressio
     """
     row, time = _times(lengths - 1)
     first = states[row, time].double()
-    return Regression.fit(torch.cat((first, states[row, time + 1].double() - first), dim=1), actions[row, time], row)
+    inputs = torch.cat((first, states[row, time + 1].double() - first), dim=1)
+    return Regression.fit(inputs, actions[row, time], row, HIDDEN, LARGEST_FIT)
 
 
 def follows_present(states: Tensor, actions: Tensor, lengths: Tensor, concepts: Sequence[str], observed: Tensor) -> bool:
@@ -130,8 +140,8 @@ def follows_present(states: Tensor, actions: Tensor, lengths: Tensor, concepts: 
         row, time = _times(lengths[some])
         known = torch.cat((states[some].double(), observed[some].double()), dim=2)
         outputs = actions[some][row, time]
-        now = Regression.fit(known[row, time], outputs, row).error
-        first = Regression.fit(torch.cat((known[row, 0], time[:, None].double()), dim=1), outputs, row).error
+        inputs = (known[row, time], torch.cat((known[row, 0], time[:, None].double()), dim=1))
+        now, first = (Regression.fit(each, outputs, row, QUICK_HIDDEN, QUICK_FIT).error for each in inputs)
         votes.append(now + SLACK < FOLLOWS * first)
     return sum(votes) * 2 > len(votes)
 

@@ -32,7 +32,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ftl_lightning.data.actions import PRESENT, action_columns, follows_present
+from ftl_lightning.data.actions import CONTEXT, PRESENT, STILL, action_columns, follows_present
 from ftl_lightning.data.columns import check_precision
 from ftl_lightning.data.demonstrations import Demonstrations, held, in_sequence
 from ftl_lightning.data.distances import warped_distances
@@ -100,6 +100,9 @@ class OwnDomain(Domain):
             UserError: also for other kinds, values that contradict a kind, and columns whose steps float32 cannot hold.
         """
         acted = demonstrations.joined if action_columns(self.plans.columns) else demonstrations
+        context = next((name for name in self.observed if name.startswith(CONTEXT) and name not in acted.observed), "")
+        if context and set(context.removeprefix(CONTEXT).split(",")) <= set(acted.state_names):
+            acted = with_context(acted, context)
         acted = with_present(acted) if PRESENT in self.observed else acted
         fitted = super().fitted(replace(acted, domain=self.name), place)
         kinds = self.plans.kinds or (LINEAR,) * len(self.plans.columns)
@@ -173,6 +176,28 @@ def own_domain(
         recordings=Recordings(recorder=drawn_by_hand(examples, horizon)),
         arguments=(examples, tuple(training), horizon, dict(metrics), source),
     )
+
+
+def context_of(demonstrations: Demonstrations) -> str:
+    """Name of the feature of the columns of states, but for actions, that differ between demonstrations only; empty for none."""
+    acts, names = action_columns(demonstrations.state_names), demonstrations.state_names
+    states = demonstrations.states.double()
+    valid = (torch.arange(states.shape[1]) < demonstrations.lengths[:, None])[..., None]
+    top, bottom = states.where(valid, -torch.inf).amax(dim=1), states.where(valid, torch.inf).amin(dim=1)  # (demo, column)
+    whole = top.amax(dim=0) - bottom.amin(dim=0)
+    still = ((top - bottom).amax(dim=0) <= STILL * whole) & (whole > 0)
+    columns = [column for column in still.nonzero()[:, 0].tolist() if column not in acts]
+    rest = len(names) - len(acts) - len(columns)
+    return CONTEXT + ",".join(names[column] for column in columns) if columns and rest else ""
+
+
+def with_context(demonstrations: Demonstrations, context: str) -> Demonstrations:
+    """Demonstrations whose columns of a context, see :func:`context_of`, are an observed feature that is known at the start."""
+    names = context.removeprefix(CONTEXT).split(",")
+    columns = [demonstrations.state_names.index(name) for name in names]
+    rest = [column for column in range(demonstrations.states.shape[2]) if column not in columns]
+    observed = {**demonstrations.observed, context: demonstrations.states[:, 0, columns].float()}
+    return replace(demonstrations.columns(rest), observed=observed)
 
 
 def with_present(demonstrations: Demonstrations) -> Demonstrations:
@@ -250,6 +275,10 @@ def domain_from_file(
     longest = int(demonstrations.lengths.max())
     usual = longest if longest <= LONGEST_PLAN else WINDOW
     acts = list(action_columns(demonstrations.state_names))
+    if acts and (context := context_of(demonstrations)):
+        note(f"{short(context, 80)}: columns that are constant in each demonstration are observed where plans start")
+        demonstrations = with_context(demonstrations, context)
+        acts = list(action_columns(demonstrations.state_names))
     followed = places(demonstrations, longest)
     if acts and horizon is None and not followed and longest > LEAST_WINDOWS * ACTED and _follows(demonstrations, acts):
         horizon, whole = ACTED, f"--data.horizon {longest} makes them whole"

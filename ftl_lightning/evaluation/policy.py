@@ -1,5 +1,6 @@
 """Receding-horizon policies: plans of a concept, executed in a domain's environment or in one's own."""
 
+import copy
 from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import Any, Protocol
 
@@ -8,13 +9,15 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from ftl_lightning.data.actions import PRESENT, action_columns, inverse_model
+from ftl_lightning.data.actions import CONTEXT, PRESENT, action_columns, inverse_model
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import PINNED, Observed, moved
 from ftl_lightning.data.pinned import Pinned
 from ftl_lightning.domains.domain import closed_loop_of
 from ftl_lightning.evaluation.closed_loop import PlanFollower, planner, sampled_plans
 from ftl_lightning.igm.composition import Composition
+from ftl_lightning.igm.diffusion import Denoiser
+from ftl_lightning.igm.forms.adapter import LowRank
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.services.errors import UserError, require, short, shown
 from ftl_lightning.services.randomness import generator
@@ -27,10 +30,39 @@ NAMES = ("state", "states", "observation", "observation.state", "agent_pos")
 """Keys of the present state in an observation that is a dictionary."""
 EXPLAINED = 0.1
 """Maximum error of an inverse model, as a share of the variance of actions, for actions to be obtained from planned states."""
+POLICY_STEPS = 3
+"""Sampler steps of a policy of a user's data, unless given: closed-loop rates are those of 10 steps, in a third of the time."""
 REST = 0.2
 """Maximum length of the last step of behaviour that ends at rest, relative to its mean step."""
 Control = Callable[[NDArray[np.float32], NDArray[np.float32]], ArrayLike]
 """Controller: ``(present states (episode, state), next planned states (episode, state)) -> actions (episode, action)``."""
+
+
+class Baked:
+    """An adapter whose change of the network is made once, for many samples.
+
+    Args:
+        adapter: adapter of a composition.
+        denoiser: network of the model.
+    """
+
+    def __init__(self, adapter: LowRank, denoiser: torch.nn.Module) -> None:
+        self.everywhere = adapter.everywhere
+        self._changed = copy.deepcopy(denoiser).requires_grad_(False)
+        for name in adapter.factors:
+            self._changed.get_parameter(name).copy_(adapter.changed(name, denoiser.get_parameter(name).detach()))
+
+    def __call__(self, denoiser: Denoiser) -> Denoiser:
+        """The changed network."""
+        return self._changed
+
+
+def baked(model: ConceptModel, concept: Composition) -> Composition:
+    """The composition to sample alone, with baked adapters."""
+    alone, denoiser = concept.uncomposed, getattr(model, "denoiser", None)
+    if not isinstance(denoiser, torch.nn.Module) or not all(isinstance(adapter, LowRank) for adapter in alone.adapters):
+        return alone
+    return alone.with_adapters(tuple(Baked(adapter, denoiser) for adapter in alone.adapters if isinstance(adapter, LowRank)))
 
 
 class Follower(Protocol):
@@ -50,9 +82,9 @@ class Follower(Protocol):
 class Acting:
     """How actions are obtained from plans of a user's data.
 
-    With a controller, or without actions in the demonstrations, from the next planned state. Otherwise by an inverse model of the
-    present and the next planned state, if it explains the actions of demonstrations that were left out of its fit; if not, actions
-    are those of the plan.
+    With a controller, or without actions in the demonstrations, from the next planned state. Where plans are windows from the
+    present state, actions are those of the plan. Otherwise by an inverse model of the present and the next planned state, if it
+    explains the actions of demonstrations that were left out of its fit; if not, actions are those of the plan.
 
     Args:
         model: model of a user's data.
@@ -72,6 +104,9 @@ class Acting:
             examples = model.examples
             assert examples is not None
             states, actions = examples.states[..., self.states], examples.states[..., self.actions]
+            if PRESENT in model.domain.observed:
+                self.words = "actions as planned from the present state"
+                return
             inverse = inverse_model(states, actions, examples.lengths)
             self._inverse = inverse if inverse.error <= EXPLAINED else None
             source = "actions by an inverse model from the next planned state" if self._inverse else "actions as planned"
@@ -174,7 +209,7 @@ class Policy(Shown):
         observe: Callable[[Any], Any] | None = None,
         seed: int = 0,
     ) -> None:
-        self.model, self.concept, self.execute = model, concept, execute
+        self.model, self.concept, self.execute = model, baked(model, concept), execute
         self._sampling, self._observe, self._seed = sampling, observe, seed
         # A user's data have examples and no environment.
         self._acting = Acting(model, act) if model.domain.closed_loop is None and model.examples is not None else None
@@ -252,13 +287,27 @@ class Policy(Shown):
             if vectors:
                 values[STATE] = given[vectors[0]]
         else:
-            values = _of_vector(_numbers("observation", given), shapes, starts)
+            vector = _numbers("observation", given)
+            values = self._of_columns(vector) or _of_vector(vector, shapes, starts)
         if PRESENT in features and STATE in values:
             values[PRESENT] = values[STATE]
         for name, columns in self.model.starts.items():
             if name not in values and STATE in values:
                 values[name] = _numbers("state", values[STATE])[..., [self._acting.states.index(column) for column in columns]]
         return _by_shape({name: values.get(name) for name in shapes}, shapes)
+
+    def _of_columns(self, vector: Tensor) -> dict[str, Tensor]:
+        """State and context of an observation ``(..., size)`` whose numbers are the columns of the file; empty for others."""
+        assert self._acting is not None
+        context = next((name for name in self.model.domain.observed if name.startswith(CONTEXT)), "")
+        columns = [self.model.domain.plans.columns[column] for column in self._acting.states]
+        still = context.removeprefix(CONTEXT).split(",") if context else []
+        whole = [*columns, *still]
+        if not context or not all(map(str.isdigit, whole)) or vector.shape[-1:] != (len(whole),):
+            return {}
+        order = sorted(whole, key=int)
+        parts = {STATE: columns, context: still}
+        return {name: vector[..., [order.index(column) for column in names]] for name, names in parts.items()}
 
 
 def _of_vector(vector: Tensor, shapes: Mapping[str, tuple[int, ...]], starts: Collection[str]) -> dict[str, Any]:

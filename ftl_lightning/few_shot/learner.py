@@ -19,7 +19,7 @@ from ftl_lightning.data.features import PINNED, InitialStates, moved
 from ftl_lightning.domains.domain import Domain, closed_loop_of
 from ftl_lightning.evaluation.closed_loop import reset
 from ftl_lightning.evaluation.execution import Execution, episodes
-from ftl_lightning.evaluation.policy import Control, Policy
+from ftl_lightning.evaluation.policy import POLICY_STEPS, Control, Policy
 from ftl_lightning.evaluation.rollout import Episodes, rollout
 from ftl_lightning.few_shot.arrays import (
     Start,
@@ -582,6 +582,8 @@ class FewShot(Shown):
         Raises:
             UserError: for a concept of another model, or a domain with neither an environment nor a user's data.
         """
+        if self.model.max_steps is not None and self.domain.closed_loop is None:
+            changes = {"steps": min(POLICY_STEPS, self.model.max_steps), **changes}
         concept, sampling = self._own("policy", concept), self._sampling("policy", changes)
         every = check_whole("execute", execute, 1) if replan is None else check_whole("replan", replan, 1)
         return Policy(self.model, concept, sampling, every, act, observe, check_whole("seed", seed, 0, None))

@@ -193,6 +193,10 @@ class Composition(Shown):
         """Replace some fields; the result is a plain :class:`Composition`."""
         return Composition(**({field.name: getattr(self, field.name) for field in fields(Composition)} | changes))
 
+    def with_adapters(self, adapters: tuple[Adapter, ...]) -> "Composition":
+        """The composition with as many other adapters."""
+        return self._with(adapters=adapters)
+
     def _at_knots(self, knots: int) -> Tensor:
         """Embeddings ``(..., K, knots, n)``; a single knot is repeated."""
         return self.embeddings.expand(*self.weights.shape, knots, -1)
