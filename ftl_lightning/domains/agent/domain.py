@@ -19,7 +19,7 @@ from ftl_lightning.domains.recorder import Recorder
 from ftl_lightning.services.errors import UserError
 
 HORIZON = 128
-RENDERING, STEERING = "ftl_lightning.domains.agent.rendering", "ftl_lightning.domains.agent.steering"
+RENDERING = "ftl_lightning.domains.agent.rendering"
 
 
 def reads(task: str) -> bool:
@@ -143,8 +143,8 @@ DOMAIN = Domain(
         recorder=Recorder(
             "steer",
             "Lead the agent, the brown dot, to where it should go; each time other objects stand elsewhere.",
-            deferred(f"{STEERING}:scene"),
-            deferred(f"{STEERING}:record"),
+            deferred(f"{RENDERING}:scene"),
+            deferred(f"{RENDERING}:record"),
             tuple(dict.fromkeys((*TRAINING_CONCEPTS, *(goal for name in ("paper", "validation") for goal in SUITES[name].goals)))),
         )
     ),

@@ -9,9 +9,8 @@ from ftl_lightning.igm.concept import Concept
 from ftl_lightning.methods.language import METHOD
 from ftl_lightning.networks.text_encoder import load_encoder
 from ftl_lightning.services.errors import require
-from ftl_lightning.training.adaptation import Adaptation
+from ftl_lightning.training.adaptation import Adaptation, Labels
 from ftl_lightning.training.concept_model import ConceptModel, TextConceptModel
-from ftl_lightning.training.labels import Labels
 
 
 class LanguageAdaptation(Adaptation):
@@ -31,7 +30,7 @@ class LanguageAdaptation(Adaptation):
         UserError: for a model of another method or encoder.
     """
 
-    labels = Labels(METHOD.name, "", "")
+    labels = Labels(METHOD.name)
 
     def __init__(
         self,
