@@ -42,7 +42,12 @@ class Number:
 
     def with_error(self) -> str:
         """Format without the spread over seeds."""
-        return f"{self.mean:.2f}" + ("" if self.error is None else f" ± {self.error:.2f}")
+        return plus_minus(self.mean, self.error)
+
+
+def plus_minus(mean: float, error: float | None) -> str:
+    """Format a mean, and its standard error if there is one."""
+    return f"{mean:.2f}" + ("" if error is None else f" ± {error:.2f}")
 
 
 def summarise(rows: pd.DataFrame) -> Number | None:
@@ -107,16 +112,12 @@ def of_method(rows: pd.DataFrame, method: Compared) -> pd.DataFrame:
     return select(rows, method=method.name, form=method.form)
 
 
-def paper(papers: Published | None) -> str:
-    """Format the paper's number with its standard error."""
-    if papers is None:
-        return MISSING
-    return f"{papers.value:.2f}" + ("" if papers.error is None else f" ± {papers.error:.2f}")
-
-
 def beside_paper(number: Number | None, papers: Published | None) -> list[str]:
     """Cells of the columns :data:`PAPERS`: the paper's number, and ours minus the paper's."""
-    return [paper(papers), MISSING if papers is None or number is None else f"{number.mean - papers.value:+.2f}"]
+    if papers is None:
+        return [MISSING, MISSING]
+    difference = MISSING if number is None else f"{number.mean - papers.value:+.2f}"
+    return [plus_minus(papers.value, papers.error), difference]
 
 
 def domain_of(name: str, rows: pd.DataFrame) -> Domain:

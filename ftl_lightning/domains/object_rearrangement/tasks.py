@@ -1,6 +1,8 @@
 """Tasks of object rearrangement: the paper's settings and numbers, and the validation suite for tuning."""
 
-from ftl_lightning.domains.comparison import Published
+from pathlib import Path
+
+from ftl_lightning.domains.comparison import published
 from ftl_lightning.domains.object_rearrangement.scenes import AND, NOT, SHAPES, TRAINING_RELATIONS, Relation
 from ftl_lightning.domains.tasks import EvaluationTask, Suite, training_suite
 
@@ -143,41 +145,4 @@ DESCRIBED = tuple(
 )
 """Texts in the table of embeddings; compositions are left out, as their parts are included."""
 
-PUBLISHED = (
-    # Figure 'accuracy' and the text of sections 4.1 and 4.2; K = 2, fixed omega 1.2
-    Published("training composition", 0.90, 0.04, omega="1.2"),
-    Published("new concept", 0.82, 0.09, omega="1.2"),
-    Published("new + training", 0.80, 0.02, omega="1.2"),
-    Published("new concept", 0.44, omega="1.2", task=_ring(1.67)),
-    # Table 'Ablation on the number of learned concepts'
-    Published("training composition", 0.28, 0.11, components=1),
-    Published("training composition", 0.75, 0.11, components=2),
-    Published("new concept", 0.49, 0.11, components=1),
-    Published("new concept", 0.77, 0.09, components=2),
-    Published("new + training", 0.38, 0.04, components=1),
-    Published("new + training", 0.73, 0.04, components=2),
-    # Table 'Classifier-free guidance weight choice effect'; 1.2 and learned are in the tables above
-    Published("new concept", 0.80, 0.10, omega="1.4"),
-    Published("new concept", 0.66, 0.08, omega="1.6"),
-    Published("new concept", 0.61, 0.06, omega="1.8"),
-    # Table 'Analysis of learned concepts': generation with each component alone
-    *(
-        Published(f"component {component}", value, task=f"{goal} (learned from: {first} and {second})")
-        for first, a, b, second, c, d in (
-            ("triangle right of square", 0.42, 0.62, "circle above square", 0.88, 0.36),
-            ("square right of triangle", 0.16, 0.64, "circle above triangle", 0.08, 0.08),
-            ("circle right of square", 0.10, 0.48, "triangle above square", 0.86, 0.40),
-            ("square right of circle", 0.14, 0.90, "triangle above circle", 0.02, 0.60),
-            ("circle right of triangle", 0.00, 0.92, "triangle right of square", 0.64, 0.14),
-        )
-        for goal, values in ((first, (a, b)), (second, (c, d)))
-        for component, value in enumerate(values, start=1)
-    ),
-    # Baselines in the table of guidance weights; language from the text
-    Published("new concept", 0.67, 0.15, method="BC"),
-    Published("new concept", 0.08, 0.05, method="CVAE"),
-    Published("training composition", 0.20, 0.07, method="language"),
-    Published("new concept", 0.20, 0.05, method="language"),
-    Published("new + training", 0.13, 0.04, method="language"),
-)
-"""The paper's numbers for object rearrangement."""
+PUBLISHED = published(Path(__file__).parent / "published.csv")  # the paper's numbers
