@@ -13,6 +13,7 @@ from ftl_lightning.domains.domain import CLOSED, COVERAGE, EXECUTED, NOVELTY, OW
 from ftl_lightning.domains.registry import domain_of_file, is_known
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.evaluation.generation import LOST, WON, standard_error
+from ftl_lightning.evaluation.results import FOLDER
 from ftl_lightning.services.errors import UserError, require, shown
 from ftl_lightning.services.text import latex, latex_row, markdown, say
 
@@ -122,7 +123,7 @@ def beside_paper(number: Number | None, papers: Published | None) -> list[str]:
 
 def domain_of(name: str, rows: pd.DataFrame) -> Domain:
     """Domain of results, made from the rows if it is not installed or of user data. Raise UserError for an invalid name."""
-    is_name = re.fullmatch(r"\w[\w .+-]{0,99}", name)
+    is_name = re.fullmatch(FOLDER, name)
     require(is_name, "results: column 'domain'", "a name of letters, digits and - . +", shown(name))
     if name != OWN and not is_known(name):
         say(f"domain {name!r} is not installed: its tables are made from the results alone", error=True)

@@ -22,7 +22,6 @@ from ftl_lightning.domains.agent.scenes import (
     object_positions,
     scenes,
 )
-from ftl_lightning.domains.agent.tasks import COMPOSITIONS
 from ftl_lightning.domains.execution import Rollout
 from ftl_lightning.domains.films import Shape, VectorFilm, regular, some, still
 from ftl_lightning.domains.pictures import framed
@@ -116,18 +115,19 @@ LONGEST, SHORTEST = (LENGTH - BRAKING) * STEP * SPEED, 0.1
 """Maximum and minimum length of a route in metres."""
 BLUR, CORNER = 0.08, 0.04
 """Standard deviation of the smoothing along the route, and distance between its corners afterwards, in metres."""
+COMPOSITION = "go to red bowl"  # the first of the paper's
 FINE = 0.005
 """Accuracy in metres of the end of a route before an object."""
 
 
 def scene(task: str, seed: int) -> Scene:
-    """Top-view scene of a task with the agent at its start; for '', of the first of the paper's compositions.
+    """Top-view scene of a task with the agent at its start; for '', of :data:`COMPOSITION`.
 
     Raises:
         UserError: without the simulator, or for an invalid task.
     """
     check_simulator()
-    world = scenes(task or COMPOSITIONS[0], 1, seed)
+    world = scenes(task or COMPOSITION, 1, seed)
     film = from_above(world[0], world[:, :3])
     x, z = world[0, list(PLANE)].tolist()
     faster = STEPS_A_SECOND * STEP  # the hand moves at the speed of films
