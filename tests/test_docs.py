@@ -13,7 +13,7 @@ import yaml
 
 from ftl_lightning.cli.main import COMMANDS, TRAINER_VERBS
 from ftl_lightning.domains.registry import domain_of_file
-from ftl_lightning.reporting.table import paper
+from ftl_lightning.reporting.table import plus_minus
 
 ROOT = Path(__file__).parent.parent
 README = ROOT / "README.md"
@@ -222,7 +222,7 @@ def test_the_papers_numbers_on_its_page_are_those_of_the_domains() -> None:
             subject = (row["setting"], row["method"], row.get("metric", ""))
             same = [one for one in of.numbers if (one.setting, one.method, one.metric) == subject]
             same = [one for one in same if one.task in ("", row.get("task")) and one.components == row.get("K", one.components)]
-            assert papers in {paper(one) for one in same}, f"{item['item']}, {name}"
+            assert papers in {plus_minus(one.value, one.error) for one in same}, f"{item['item']}, {name}"
             checked += 1
     assert checked > 30
 

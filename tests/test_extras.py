@@ -14,11 +14,11 @@ from packaging.requirements import Requirement
 
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.driving.traffic import SHIPPED
-from ftl_lightning.domains.mocap.measures import learned_elsewhere
 from ftl_lightning.reporting.concept_figures import concept_map
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.shipped import EXTRAS, check_extra
 from tests.conftest import CONF, ROOT, environment, refused
+from tests.domains.mocap_samples import script
 from tests.domains.test_from_file import walks
 from tests.tiny import QUIET
 
@@ -147,7 +147,10 @@ def test_plans_of_driving_are_made_without_the_simulator_and_executed_with_it(to
 
 def test_what_needs_scikit_learn_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "sklearn", None)  # as if it was not installed
-    for call, extra in ((lambda: concept_map(None, []), "notebooks"), (lambda: learned_elsewhere({}, {}), "mocap")):
+    for call, extra in (
+        (lambda: concept_map(None, []), "notebooks"),
+        (lambda: script("mocap_distances").learned_elsewhere({}, {}), "mocap"),
+    ):
         told = rf"needs the package scikit-learn, which is not installed; .*'ftl-lightning\[{extra}\]'"
         with pytest.raises(UserError, match=told):
             call()

@@ -20,9 +20,9 @@ import pytest
 import safetensors.torch
 import torch
 
+from ftl_lightning.cli.concepts import SampleOptions
 from ftl_lightning.cli.demonstrations import generate
 from ftl_lightning.cli.main import main
-from ftl_lightning.cli.sample import SampleOptions
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.formats import files
 from ftl_lightning.domains.registry import load_domain
@@ -30,8 +30,7 @@ from ftl_lightning.evaluation.evaluator import Evaluator
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.igm.settings import INVERSION, InversionSettings
-from ftl_lightning.methods.ftl_igm.codes import Codes
-from ftl_lightning.methods.ftl_igm.pretraining import LossOptions, PretrainingModule
+from ftl_lightning.methods.ftl_igm.pretraining import Codes, LossOptions, PretrainingModule
 from ftl_lightning.services.files import MOST_HEADER, MOST_TENSORS, VARIABLE, check_writable_file, check_writable_folder
 from ftl_lightning.training.data import InversionData, PretrainingData
 from ftl_lightning.training.trainer import Trainer

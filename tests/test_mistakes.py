@@ -29,10 +29,8 @@ from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.evaluation.evaluator import Evaluator
 from ftl_lightning.igm import settings
 from ftl_lightning.igm.concept import VERSION
-from ftl_lightning.methods.bc.pretraining import CloningPretraining
-from ftl_lightning.methods.cvae.pretraining import VAEPretraining
-from ftl_lightning.methods.ftl_igm.codes import Codes
-from ftl_lightning.methods.ftl_igm.pretraining import LossOptions, PretrainingModule
+from ftl_lightning.methods.ftl_igm.pretraining import Codes, LossOptions, PretrainingModule
+from ftl_lightning.methods.pretraining import CloningPretraining, VAEPretraining
 from ftl_lightning.services.errors import LONGEST, Note, UserError
 from ftl_lightning.training.checkpoint import WholeCheckpoints
 from ftl_lightning.training.data import InversionData, PretrainingData

@@ -19,7 +19,6 @@ ENTRANCE = [
     "ftl_lightning.cli.demonstrations",
     "ftl_lightning.cli.experiments",
     "ftl_lightning.cli.pages",
-    "ftl_lightning.cli.sample",
     "ftl_lightning.igm.composition",
     "ftl_lightning.igm.concept",
     "ftl_lightning.igm.forms.modes",

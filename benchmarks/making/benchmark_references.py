@@ -7,7 +7,7 @@ import argparse
 from pathlib import Path
 
 from ftl_lightning.apps.benchmark.check import check_submission
-from ftl_lightning.apps.benchmark.references import FILE, References
+from ftl_lightning.apps.benchmark.leaderboard import FILE, References
 
 
 def main() -> None:

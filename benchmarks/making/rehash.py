@@ -33,7 +33,7 @@ from ftl_lightning.evaluation.evaluator import Evaluator
 from ftl_lightning.evaluation.generation import OWN
 from ftl_lightning.evaluation.results import config_hash, configuration, reference_hash
 from ftl_lightning.igm.settings import INVERSION, InversionSettings
-from ftl_lightning.methods.language import adaptation as language
+from ftl_lightning.methods import adaptation as language
 from ftl_lightning.services import log_folder
 from ftl_lightning.services.tensor_file import content_hash
 from ftl_lightning.training import adaptation, data

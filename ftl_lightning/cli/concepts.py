@@ -1,13 +1,21 @@
-"""Verbs for learned concepts: ``invert`` without a trainer, ``concepts``, ``explain``. Imports are local, for a fast start."""
+"""Verbs for concepts: ``invert`` without a trainer, ``sample``, ``concepts``, ``explain``. Imports are local, for a fast start."""
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
-from ftl_lightning.services.errors import about
+from ftl_lightning.services.errors import about, require
 from ftl_lightning.services.text import line, say
 from ftl_lightning.services.validation import LARGEST_STEP, check_count, check_range
+
+if TYPE_CHECKING:
+    from ftl_lightning.data.features import InitialStates
+    from ftl_lightning.domains.domain import Domain
+
+MOST_SAMPLES, MOST_DRAWN = 10_000, 1000
+"""Maximum number of samples of a command, which are one batch, and of samples in a figure."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +68,172 @@ def invert(options: InvertOptions) -> None:
         say("note:", line(str(note.message)), error=True)
     for name, path in files.items():
         write_concept(learned[name].concept, path, learned[name].inspection)
+
+
+@dataclass(frozen=True)
+class SampleOptions:
+    """Generate behaviour from a learned concept, composed with training concepts.
+
+    Attributes:
+        pretrained: folder of the pretrained model, or the name of a shipped model.
+        concept: file of a learned concept; empty for training concepts alone.
+        compose: concepts to compose with it, with guidance weights: "circle right of square:1.2 + other.safetensors:0.9".
+            Training concepts, or learned concepts, whose weights are multiplied, by file or by name in the list of the verb
+            concepts. The default weight is 1. "walk@legs:1" restricts a concept to groups of a state's columns, in domains with
+            groups.
+        count: number of samples.
+        seed: seed of the samples.
+        sampler: see ftl_lightning.igm.samplers; empty for that of the settings.
+        steps: sampler steps; 0 for those of the settings.
+        temperature: the paper's alpha; lower is less diverse and more accurate; null for that of the settings.
+        goal: judge the samples by this task and print their accuracy. In domains with initial states, new ones of this task are
+            drawn from the seed; without a goal, those of the concept's task, or of the first composed text.
+        initial: demonstrations file with initial states to use instead; one sample for each.
+        out: demonstrations file to write, as for generate.
+        figure: picture to write, .png or .svg.
+        execute: also execute the concept in closed loop from the same initial states, in domains with an environment, and print
+            outcomes.
+        replan: steps between plans; 1 in the paper; 0 for that of the settings.
+        settings: configuration file of invert with settings of sampling and replanning; empty for that of the domain.
+        animation: .gif to write of the first executed episode, or of the first plan, if plans are motion.
+        export: file to write each sample to for other programs, in domains with exports: .bvh of human motion, for Blender. Files
+            of several samples are numbered: "walk.bvh" becomes walk_0.bvh, walk_1.bvh and so on.
+    """
+
+    pretrained: str
+    concept: str = ""
+    compose: str = ""
+    count: int = 50
+    seed: int = 0
+    sampler: Literal["", "ddpm", "ddim", "dpm_solver"] = ""
+    steps: int = 0
+    temperature: float | None = None
+    goal: str = ""
+    initial: str = ""
+    out: str = "states.safetensors"
+    figure: str = ""
+    execute: bool = False
+    replan: int = 0
+    animation: str = ""
+    export: str = ""
+    settings: str = ""
+
+    def __post_init__(self) -> None:
+        for name, path, endings in (("animation", self.animation, (".gif",)), ("figure", self.figure, (".png", ".svg", ".pdf"))):
+            valid = not path or Path(path).suffix in endings
+            require(valid, name, f"a name that ends in {' or '.join(endings)}", repr(path))
+        check_range("seed", self.seed, 0)
+        check_count("count", self.count, 1, MOST_DRAWN if self.figure else MOST_SAMPLES)
+        check_count("steps", self.steps, 0)
+        check_count("replan", self.replan, 0)
+
+
+def sample(options: SampleOptions) -> None:
+    """Generate behaviour as in ``options``; write, judge, draw and execute it."""
+    from ftl_lightning.evaluation.pictures import captioned, gif
+    from ftl_lightning.few_shot.learner import FewShot
+    from ftl_lightning.services.tensor_file import atomic, write_text
+    from ftl_lightning.training.quality import calibration_of
+
+    model = FewShot.from_pretrained(options.pretrained, options.settings or None)
+    text = " + ".join(part for part in (options.compose, options.concept) if part)
+    known = model.compose(text) if text else None  # unknown concepts are reported before missing ones
+    _check_sample(options, model.domain)
+    composition = model.compose(text) if known is None else known
+    goal, film = options.goal, model.domain.show.film
+    starts = _sample_starts(options, model.domain)
+    exported = _export_files(options.export, options.count if starts is None else len(starts))
+    plans = model.sample(composition, options.count if starts is None else None, starts, seed=options.seed, **_sampling(options))
+    provenance = {**plans.provenance, "concept": options.concept, "compose": options.compose}
+    plans = replace(plans, concepts=(goal,) * len(plans), provenance=provenance)
+    plans.save(options.out)
+    # Without a configuration of the domain, the settings of invert must be given again.
+    say(f"{options.out}: {len(plans)} samples; settings of {model.settings}")
+    for name, value in (model.evaluate(plans, goal) if goal and model.domain.metrics else {}).items():
+        calibration = calibration_of(model.judging, goal, name)
+        say(f"{name} on '{goal}': {value:.2f}{f' ({calibration})' if calibration else ''}")
+    if options.figure:
+        with atomic(options.figure) as temporary:
+            model.render(plans, goal).savefig(temporary, dpi=110)
+        say(options.figure)
+    for path, states in zip(exported, plans.states, strict=False):
+        write_text(path, model.domain.show.exports[path.suffix](states))
+    if exported:
+        say(exported[0] if len(exported) == 1 else f"{exported[0]} to {exported[-1].name}")
+    if options.execute and starts is not None:
+        done = model.execute(composition, starts, goal, replan=options.replan or None, seed=options.seed, **_sampling(options))
+        for name, value in done.outcomes.items():
+            say(f"closed loop, {name}: {value:.2f}, mean of {len(starts)} episodes")
+        if options.animation:
+            done.save(options.animation)
+    elif options.animation and film:
+        with atomic(options.animation) as temporary:
+            temporary.write_bytes(gif(captioned(film(plans.states[0]), goal or Path(options.concept).stem)))
+    if options.animation:
+        say(options.animation)
+
+
+def _sampling(options: SampleOptions) -> dict[str, Any]:
+    """Changes to the configured sampling."""
+    changes: dict[str, Any] = {"sampler": options.sampler} if options.sampler else {}
+    changes |= {"steps": options.steps} if options.steps else {}
+    return changes | ({} if options.temperature is None else {"temperature": options.temperature})
+
+
+def _check_sample(options: SampleOptions, domain: "Domain") -> None:
+    """Refuse options that the domain does not support, before sampling."""
+    if options.goal:
+        domain.check_goal(options.goal)
+    if options.animation and options.execute and domain.closed_loop:
+        advice = f"{domain.name}; give its ClosedLoop a film, or draw --figure"
+        require(domain.closed_loop.film, "animation", "a domain that films episodes", advice)
+    if options.export:
+        known = " or ".join(domain.show.exports)
+        expected = f"a name that ends in {known}" if known else f"none, as nothing else reads plans of {domain.name}"
+        require(Path(options.export).suffix in domain.show.exports, "export", expected, repr(options.export))
+    if options.execute:
+        require(domain.closed_loop, "execute", "a domain with an environment", f"{domain.name}, which has none")
+    if options.execute and domain.closed_loop is not None:
+        domain.closed_loop.expect()
+    if options.animation and not options.execute:
+        expected = f"--execute true (plans of {domain.name} are not filmed)"
+        require(domain.show.film, "animation", expected, repr(options.animation))
+    if domain.observed:
+        expected = f"a task or a demonstrations file to start from (domain {domain.name})"
+        require(options.initial or _start_task(options, domain), "goal, initial", expected, "neither")
+
+
+def _export_files(export: str, count: int) -> list[Path]:
+    """A file for each sample, numbered if there are several. Raise UserError before sampling, if an existing path is not a file."""
+    from ftl_lightning.services.files import check_file
+
+    if not export:
+        return []
+    path, digits = Path(export), len(str(count - 1))
+    files = [path.with_stem(f"{path.stem}_{number:0{digits}}") for number in range(count)] if count > 1 else [path]
+    for file in files:
+        check_file(file, "export")
+    return files
+
+
+def _sample_starts(options: SampleOptions, domain: "Domain") -> "InitialStates | None":
+    """Initial states of a file's demonstrations or of the goal; ``None`` without observations."""
+    if options.initial:
+        from ftl_lightning.domains.from_file import read_demonstrations
+
+        return read_demonstrations(options.initial, domain).initial_states
+    task = _start_task(options, domain)
+    return domain.source(None).starts(task, options.count, options.seed) if domain.observed else None
+
+
+def _start_task(options: SampleOptions, domain: "Domain") -> str:
+    """Task of the initial states; empty without a task that the domain can read."""
+    from ftl_lightning.few_shot.composition_text import parse_composition
+    from ftl_lightning.igm.concept import Concept
+
+    learned = (Concept.load(options.concept).origin.name,) if options.concept and not options.goal else ()
+    named = (options.goal, *learned, *(part.concept for part in parse_composition(options.compose)))
+    return next((text for text in named if text and domain.concepts.reads(text)), "")
 
 
 def concepts(pretrained: str, folder: list[str] = [], plain: bool = False) -> None:  # noqa: B006 (never changed)

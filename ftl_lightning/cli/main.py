@@ -12,7 +12,7 @@ from typing import Any
 
 from omegaconf.errors import OmegaConfBaseException
 
-from ftl_lightning.cli import concepts, demonstrations, experiments, pages, sample
+from ftl_lightning.cli import concepts, demonstrations, experiments, pages
 from ftl_lightning.services import trust
 from ftl_lightning.services.command_line import TRAINER, Arguments, check_inputs, command_checks, one_line
 from ftl_lightning.services.errors import LONGEST, Note, UserError, mistake_of_machine, require, short
@@ -85,7 +85,7 @@ COMMANDS: Mapping[str, Command] = {
         positional=True,
     ),
     "sample": Command(
-        "generate behaviour from a learned concept, composed with training concepts", sample.sample, sample.SampleOptions
+        "generate behaviour from a learned concept, composed with training concepts", concepts.sample, concepts.SampleOptions
     ),
     "view": Command(
         "watch demonstrations, samples, a concept or results on a page", pages.view, pages.ViewOptions, positional=True

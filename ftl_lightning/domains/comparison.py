@@ -1,7 +1,9 @@
 """Comparison of results: names of methods and forms, published numbers, reference policies and distances between plans."""
 
+import csv
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import NamedTuple
 
 from torch import Tensor
@@ -54,6 +56,15 @@ class Published:
     task: str = ""
     metric: str = "accuracy"
     method: str = OURS
+
+
+def published(path: Path) -> tuple[Published, ...]:
+    """Numbers of the paper in a CSV file, whose columns are the attributes of :class:`Published` and the place in the paper."""
+    with path.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    numbers = [(float(row["value"]), float(row["error"]) if row["error"] else None, int(row["components"])) for row in rows]
+    texts = [(row["omega"], row["task"], row["metric"], row["method"]) for row in rows]
+    return tuple(Published(row["setting"], *of, *named) for row, of, named in zip(rows, numbers, texts, strict=True))
 
 
 @dataclass(frozen=True)

@@ -135,13 +135,18 @@ def framed(count: int, right: Sequence[bool] | None, title: str, columns: int, s
     figure = Figure(figsize=(size[0] * columns, size[1] * rows + 0.4), layout="constrained")
     figure.suptitle(figure_text(title), fontsize=9)
     figure.subplots(rows, columns, squeeze=False)
-    for axes, good in zip(figure.axes, [None] * count if right is None else right, strict=False):
+    for axes, colour in zip(figure.axes, frame_colours(count, right), strict=False):
         axes.set(xticks=[], yticks=[], aspect="equal")
         for spine in axes.spines.values():
-            spine.set(color=PLAIN if good is None else RIGHT if good else WRONG, linewidth=2.0)
+            spine.set(color=colour, linewidth=2.0)
     for axes in figure.axes[count:]:
         axes.set_axis_off()
     return figure
+
+
+def frame_colours(count: int, right: Sequence[bool] | None) -> list[str]:
+    """Colours of the frames of ``count`` plans: green for right plans, red for wrong ones, grey if they are not judged."""
+    return [PLAIN] * count if right is None else [RIGHT if good else WRONG for good in right]
 
 
 def _grid(names: Sequence[str], groups: Sequence[Drawn], title: str) -> "Figure":
@@ -159,10 +164,9 @@ def _grid(names: Sequence[str], groups: Sequence[Drawn], title: str) -> "Figure"
     flat = states.flatten(0, 1)
     low, high = flat.amin(dim=0).tolist(), flat.amax(dim=0).tolist()
     for group, count, end in zip(groups, rows, itertools.accumulate(rows), strict=True):
-        plans, right = group.states.numpy(), group.right
+        plans = group.states.numpy()
         panels = grid[end - count : end].flatten()
-        frames = [PLAIN] * len(plans) if right is None else [RIGHT if good else WRONG for good in right]
-        for axes, plan, frame in zip(panels, plans, frames, strict=False):
+        for axes, plan, frame in zip(panels, plans, frame_colours(len(plans), group.right), strict=False):
             if paths:
                 axes.plot(*plan.T, color=PATH, linewidth=1.2)
                 axes.plot(*plan[:1].T, "o", color=START, markersize=3)

@@ -1,9 +1,12 @@
 """Evaluation tasks and suites."""
 
+import csv
 from dataclasses import dataclass
-from typing import Literal
+from pathlib import Path
+from typing import Any, Literal
 
 from ftl_lightning.services.errors import require
+from ftl_lightning.services.validation import from_mapping
 
 WITHOUT_WEIGHT = -0.5
 """Guidance weight of the texts in ``without``."""
@@ -77,6 +80,22 @@ class Suite:
 def training_suite(concepts: tuple[str, ...]) -> Suite:
     """Suite of single training concepts."""
     return Suite(tuple(EvaluationTask("training concept", text, texts=(text,)) for text in concepts))
+
+
+def read_suites(path: Path) -> dict[str, Suite]:
+    """Suites of a CSV file by name: a line for each task, with the attributes of :class:`EvaluationTask` but ``on``.
+
+    Several names are separated by semicolons; an empty cell is the attribute's default.
+    """
+    suites: dict[str, tuple[EvaluationTask, ...]] = {}
+    with path.open(encoding="utf-8", newline="") as file:
+        for number, row in enumerate(csv.DictReader(file), start=2):
+            given: dict[str, Any] = {key: text for key, text in row.items() if text}
+            given |= {key: given[key].split("; ") for key in ("learned", "texts", "without") if key in given}
+            given |= {"component": int(given["component"])} if "component" in given else {}
+            suite = given.pop("suite")
+            suites[suite] = (*suites.get(suite, ()), from_mapping(EvaluationTask, given, f"line {number}"))
+    return {name: Suite(tasks) for name, tasks in suites.items()}
 
 
 def few_shot_suites(training: tuple[str, ...], new: tuple[str, ...]) -> dict[str, Suite]:

@@ -16,8 +16,8 @@ from ftl_lightning.evaluation.generation import Evaluable, Generation, TaskResul
 from ftl_lightning.evaluation.pictures import write_films
 from ftl_lightning.evaluation.references import lines, real_behaviour, references
 from ftl_lightning.evaluation.results import config_hash, configuration, rows
-from ftl_lightning.evaluation.summary import hparams_of, record
-from ftl_lightning.evaluation.tensorboard import draw, log_projector, log_test, own_rows, setting_means
+from ftl_lightning.evaluation.summary import hparams_of, own_rows, record
+from ftl_lightning.evaluation.tensorboard import draw, log_projector, log_test, setting_means
 from ftl_lightning.services.errors import require, shown
 from ftl_lightning.services.text import say
 from ftl_lightning.services.validation import check_count

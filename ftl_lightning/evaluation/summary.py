@@ -88,6 +88,11 @@ def _number(text: str) -> float | str:
         return text
 
 
+def own_rows(rows: Sequence[Row]) -> list[Row]:
+    """Rows of the method without reference lines and paired comparisons."""
+    return [row for row in rows if row.role == METHOD and not row.metric.startswith((WON, LOST))]
+
+
 def summary_table(rows: Sequence[Row], single: Sequence[str] = ()) -> Table:
     """Summarise an evaluation: a line for each task in ``single``, then the mean of each setting.
 
@@ -98,7 +103,7 @@ def summary_table(rows: Sequence[Row], single: Sequence[str] = ()) -> Table:
         rows: rows of an evaluation, see :func:`ftl_lightning.evaluation.results.rows`.
         single: names of tasks with a separate line, for example the concepts of user demonstrations.
     """
-    measured = [row for row in rows if row.role == METHOD and not row.metric.startswith((WON, LOST))]
+    measured = own_rows(rows)
     metrics = list(dict.fromkeys(row.metric for row in measured))
     metrics.sort(key=lambda name: DIVERSITY.index(name) if name in DIVERSITY else -1)  # diversity last
     table = Table(title=literal(_title(measured), "table.title"), box=box.SIMPLE, title_justify="left", padding=0)

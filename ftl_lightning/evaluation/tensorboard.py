@@ -21,10 +21,10 @@ from torch.utils.tensorboard.writer import FileWriter
 from ftl_lightning.data.places import first_windows
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.pictures import Drawn, beside
-from ftl_lightning.evaluation.generation import LOST, WON, TaskResult, share
+from ftl_lightning.evaluation.generation import TaskResult, share
 from ftl_lightning.evaluation.pictures import captioned, gif, outcome_text
-from ftl_lightning.evaluation.results import METHOD, Row
-from ftl_lightning.evaluation.summary import plain, summary_table
+from ftl_lightning.evaluation.results import Row
+from ftl_lightning.evaluation.summary import own_rows, plain, summary_table
 from ftl_lightning.igm.concept import Part, Point
 from ftl_lightning.services.text import line
 from ftl_lightning.training.board import FILMS, PICTURES, RESULTS, ROLLOUTS
@@ -92,11 +92,6 @@ def setting_means(values: Iterable[tuple[str, str, float]]) -> dict[str, float]:
     for setting, metric, value in values:
         by_name.setdefault(f"{metric}/{setting}", []).append(value)
     return {name: sum(task_values) / len(task_values) for name, task_values in by_name.items()}
-
-
-def own_rows(rows: Sequence[Row]) -> list[Row]:
-    """Rows of the method without reference lines and paired comparisons."""
-    return [row for row in rows if row.role == METHOD and not row.metric.startswith((WON, LOST))]
 
 
 @rank_zero_only

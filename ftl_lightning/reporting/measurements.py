@@ -6,7 +6,7 @@ The files are JSON, since their columns differ from those of results files, whic
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -30,11 +30,6 @@ FRONTIER = "frontier.json"
 """File of accuracy over coverage in a folder of results; ``benchmarks/experiments/frontier.py`` writes it."""
 NOISY = "demonstrations with noise"
 """Reference line without learning; its temperature is the noise, as a share of the demonstrations' standard deviation."""
-SUBJECT = ["domain", "suite", "setting", "task", "method", "form", "variant", "temperature", "seed", "n"]
-"""Columns that identify a measurement; ``temperature`` is missing for reference lines and methods without temperature."""
-_MEASURES = ["accuracy", "novelty", "coverage"]
-"""Columns of numbers, missing if not measured; ``accuracy`` is the domain's main metric."""
-COLUMNS = [*SUBJECT, *_MEASURES]
 
 
 def _read(path: str | Path, name: str, key: str, kind: Callable[..., T], expected: str) -> list[T]:
@@ -82,23 +77,28 @@ def reached(curves: Mapping[str, Sequence[Measured]]) -> float:
     return min(curve[-1].accuracy for curve in curves.values()) - WITHIN
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _FrontierRow:
-    """A row of :data:`FRONTIER`, for validation; columns as in :data:`COLUMNS`."""
+    """A row of :data:`FRONTIER`."""
 
     domain: str
     suite: str
     setting: str
     task: str
     method: str
-    seed: int
-    n: int
     form: str = ""
     variant: str = ""
-    temperature: float = math.nan
-    accuracy: float = math.nan
+    temperature: float = math.nan  # missing for reference lines and methods without temperature
+    seed: int
+    n: int
+    accuracy: float = math.nan  # the domain's main metric
     novelty: float = math.nan
     coverage: float = math.nan
+
+
+COLUMNS = [field.name for field in fields(_FrontierRow)]
+_MEASURES = ["accuracy", "novelty", "coverage"]  # missing if not measured
+SUBJECT = [name for name in COLUMNS if name not in _MEASURES]  # columns that identify a measurement
 
 
 def read_frontier(path: str | Path) -> pd.DataFrame:

@@ -3,7 +3,6 @@
 import base64
 import gzip
 import json
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,7 @@ from ftl_lightning.reporting.tables import AXES, points
 from ftl_lightning.services.errors import UserError, require
 from ftl_lightning.services.shipped import FILM, shipped
 from ftl_lightning.services.tensor_file import visible, write_text
-from ftl_lightning.services.text import say
+from ftl_lightning.services.text import filled, say
 from ftl_lightning.services.validation import read_json
 from ftl_lightning.training.model_folder import load_model
 from ftl_lightning.version import __version__
@@ -200,5 +199,4 @@ def _html(content: Mapping[str, Any]) -> str:
         "SCRIPT": FILM.read_text(encoding="utf-8") + (HERE / "page.js").read_text(encoding="utf-8"),
         "DATA": base64.b64encode(gzip.compress(raw, mtime=0)).decode(),  # base64 cannot end the script
     }
-    template = (HERE / "page.html").read_text(encoding="utf-8")
-    return re.sub(f"%({'|'.join(parts)})%", lambda match: parts[match[1]], template)
+    return filled((HERE / "page.html").read_text(encoding="utf-8"), parts)

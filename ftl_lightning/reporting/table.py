@@ -13,6 +13,7 @@ from ftl_lightning.domains.domain import CLOSED, COVERAGE, EXECUTED, NOVELTY, OW
 from ftl_lightning.domains.registry import domain_of_file, is_known
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.evaluation.generation import LOST, WON, standard_error
+from ftl_lightning.evaluation.results import FOLDER
 from ftl_lightning.services.errors import UserError, require, shown
 from ftl_lightning.services.text import latex, latex_row, markdown, say
 
@@ -42,7 +43,12 @@ class Number:
 
     def with_error(self) -> str:
         """Format without the spread over seeds."""
-        return f"{self.mean:.2f}" + ("" if self.error is None else f" ± {self.error:.2f}")
+        return plus_minus(self.mean, self.error)
+
+
+def plus_minus(mean: float, error: float | None) -> str:
+    """Format a mean, and its standard error if there is one."""
+    return f"{mean:.2f}" + ("" if error is None else f" ± {error:.2f}")
 
 
 def summarise(rows: pd.DataFrame) -> Number | None:
@@ -107,21 +113,17 @@ def of_method(rows: pd.DataFrame, method: Compared) -> pd.DataFrame:
     return select(rows, method=method.name, form=method.form)
 
 
-def paper(papers: Published | None) -> str:
-    """Format the paper's number with its standard error."""
-    if papers is None:
-        return MISSING
-    return f"{papers.value:.2f}" + ("" if papers.error is None else f" ± {papers.error:.2f}")
-
-
 def beside_paper(number: Number | None, papers: Published | None) -> list[str]:
     """Cells of the columns :data:`PAPERS`: the paper's number, and ours minus the paper's."""
-    return [paper(papers), MISSING if papers is None or number is None else f"{number.mean - papers.value:+.2f}"]
+    if papers is None:
+        return [MISSING, MISSING]
+    difference = MISSING if number is None else f"{number.mean - papers.value:+.2f}"
+    return [plus_minus(papers.value, papers.error), difference]
 
 
 def domain_of(name: str, rows: pd.DataFrame) -> Domain:
     """Domain of results, made from the rows if it is not installed or of user data. Raise UserError for an invalid name."""
-    is_name = re.fullmatch(r"\w[\w .+-]{0,99}", name)
+    is_name = re.fullmatch(FOLDER, name)
     require(is_name, "results: column 'domain'", "a name of letters, digits and - . +", shown(name))
     if name != OWN and not is_known(name):
         say(f"domain {name!r} is not installed: its tables are made from the results alone", error=True)

@@ -4,6 +4,7 @@ import functools
 import operator
 from abc import ABC, abstractmethod
 from pathlib import Path
+from typing import NamedTuple
 
 import lightning.pytorch as pl
 import torch
@@ -23,9 +24,22 @@ from ftl_lightning.services.modes import usual_modes
 from ftl_lightning.training.checks import longer_than_plans, notes_of
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.data import InversionData
-from ftl_lightning.training.labels import Labels
 from ftl_lightning.training.model_folder import kinds_for, load_model
 from ftl_lightning.training.quality import Inspection, inspected, judging_domain
+
+
+class Labels(NamedTuple):
+    """Labels of an adaptation's rows in tables.
+
+    Attributes:
+        method: name of the method.
+        form: form of the concepts; empty for the paper's form, a single set of embeddings constant over time.
+        variant: parametrisation of the embeddings and other options, separated by commas.
+    """
+
+    method: str
+    form: str = ""
+    variant: str = ""
 
 
 class Adaptation(pl.LightningModule, ABC):
@@ -63,7 +77,7 @@ class Adaptation(pl.LightningModule, ABC):
     @property
     def labels(self) -> Labels:
         """Labels of the rows in tables; by default the method's name alone."""
-        return Labels(self.model.method.name, "", "")
+        return Labels(self.model.method.name)
 
     @classmethod
     @abstractmethod

@@ -6,12 +6,19 @@ from typing import Literal
 
 import torch
 
+from ftl_lightning.domains.comparison import CHOSEN, FINE_TUNED, WITH_ADAPTER, WITH_MODES
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.igm.forms.choice import first_settings
 from ftl_lightning.igm.inversion import Inversion
 from ftl_lightning.igm.settings import (
+    ADAPTED,
+    AUTO,
+    COMBINED,
     INVERSION,
+    MIXED,
+    MODES,
+    NOT_LEARNED,
     AdapterOptions,
     BudgetOptions,
     EmbeddingOptions,
@@ -23,13 +30,17 @@ from ftl_lightning.igm.settings import (
 from ftl_lightning.services.modes import usual_modes
 from ftl_lightning.services.progress import bar
 from ftl_lightning.services.validation import flat, groups_of
-from ftl_lightning.training.adaptation import Adaptation, LearnerAdaptation
+from ftl_lightning.training.adaptation import Adaptation, Labels, LearnerAdaptation
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.in_processes import learned_in_processes
-from ftl_lightning.training.labels import Labels, labels
 from ftl_lightning.training.method import Method
 
 _USUAL = InversionSettings()
+FORMS = {
+    **{AUTO: CHOSEN, MODES: WITH_MODES, ADAPTED: WITH_ADAPTER, MIXED: f"{WITH_MODES} {WITH_ADAPTER}", COMBINED: COMBINED},
+    **{form: f"{form}, not learned" for form in NOT_LEARNED},
+}
+"""Names in tables of forms that override modes and adapter."""
 
 
 class InversionModule(Adaptation):
@@ -74,7 +85,24 @@ class InversionModule(Adaptation):
     @property
     def labels(self) -> Labels:
         """Labels of the settings, whose form is selected for a user's demonstrations."""
-        return labels(self.model.method, self.model.traits, self.settings, self.hparams)
+        settings, method, decided = self.settings, self.model.method, FORMS.get(self.settings.form)
+        embeddings, weights, adapter = settings.embeddings, settings.weights, settings.adapter
+        fine_tuned = adapter.rank > 0 and adapter.scope == "all"
+        form = method.form({**self.hparams, **({"modes": 1, "adapter": 0} if decided else {})})
+        span = {1.0: "free", 0.0: "span"}.get(embeddings.off_span, f"near span {embeddings.off_span:g}")
+        sets = 1 if decided else settings.modes.sets
+        parts = {
+            f"modes: {sets}": sets not in (1, "auto"),
+            f"{embeddings.knots} knots": embeddings.knots > 1,
+            f"guidance {weights.scale:g}": settings.omega == "learned" and weights.scale != 1,
+            f"rank {adapter.rank}": adapter.rank > 0,
+            f"training weight {weights.training or 0:g}": weights.training is not None,
+        }
+        return Labels(
+            FINE_TUNED if fine_tuned else method.name,
+            "" if fine_tuned else " ".join(word for word in (form, decided) if word),
+            ", ".join([*self.model.traits, span, *(text for text, applies in parts.items() if applies)]),
+        )
 
     @classmethod
     def adapts(cls, model: type[ConceptModel]) -> bool:

@@ -101,7 +101,7 @@ def _offered() -> dict[str, str]:
 
 def _ours() -> dict[str, str]:
     """Methods of this package, without a look-up of installed packages."""
-    return {name: f"ftl_lightning.methods.{name}:METHOD" for name in SHIPPED}
+    return {name: f"ftl_lightning.methods.declared:{name.upper()}" for name in SHIPPED}
 
 
 def load_method(name: str) -> Method:

@@ -14,7 +14,6 @@ from ftl_lightning.domains.agent.domain import DOMAIN, act, progressed, reached
 from ftl_lightning.domains.agent.environment import AgentEnvironment, bowl, cone
 from ftl_lightning.domains.agent.expert import initial_states
 from ftl_lightning.domains.agent.scenes import FEATURE, MAX_FORCE, MAX_STEPS, OBSERVED, REACH, STEP, pairs, parse, scenes, target
-from ftl_lightning.domains.agent.tasks import COMPOSITIONS, TRAINING_CONCEPTS
 from ftl_lightning.domains.execution import Rollout
 from ftl_lightning.services.errors import UserError
 
@@ -54,12 +53,12 @@ def test_pairs_are_the_papers_distractors_and_sixteen_of_pretraining_with_none_o
         ("go to purple cone", {("purple", "bowl"), ("purple", "cube"), ("red", "cone"), ("yellow", "cone")}),
     ):
         assert {distractor for _, distractor in pairs(parse(task))} == distractors
-    found = [pair for task in TRAINING_CONCEPTS for pair in pairs(parse(task))]
+    found = [pair for task in world.TRAINING_CONCEPTS for pair in pairs(parse(task))]
     assert len(set(found)) == 16
     seen = {look for pair in found for look in pair}
     assert {colour for colour, _ in seen} == set(world.COLOURS)
     assert {shape for _, shape in seen} == set(world.SHAPES)
-    assert not seen & {(parse(task).colour, parse(task).shape) for task in COMPOSITIONS}
+    assert not seen & {(parse(task).colour, parse(task).shape) for task in DOMAIN.concepts.suites["paper"].goals}
 
 
 @pytest.mark.parametrize("task", ["go to bowl", "go to purple cone"])

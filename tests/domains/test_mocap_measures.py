@@ -8,7 +8,7 @@ from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.mocap import measures
 from ftl_lightning.domains.mocap.domain import BLENDED, DOMAIN, VIEWS, begun_elsewhere, smoothed, with_rigid_bones
 from ftl_lightning.domains.mocap.judge import Judge
-from ftl_lightning.domains.mocap.measures import RULES, bone_error, distances, diversity, jerk, learned_elsewhere, rise
+from ftl_lightning.domains.mocap.measures import RULES, bone_error, jerk, rise
 from ftl_lightning.domains.mocap.skeleton import (
     FPS,
     HORIZON,
@@ -25,6 +25,7 @@ from ftl_lightning.domains.mocap.skeleton import (
     walking_poses,
 )
 from ftl_lightning.services.errors import UserError
+from tests.domains.mocap_samples import script
 
 TIME = torch.linspace(0, 1, HORIZON)
 PHASE = (1 - torch.cos(2 * math.pi * TIME)) / 2
@@ -210,6 +211,7 @@ def test_sets_are_near_when_equal_and_compared_at_equal_numbers_and_repeatably(j
     def trembling(size: float) -> Tensor:
         return people(60) + size * torch.randn(60, HORIZON, 42, generator=draw)
 
+    distances = script("mocap_distances").distances
     same = distances(trembling(0.01), trembling(0.01), seed=0, judge=judge)
     other = distances(trembling(0.1), trembling(0.01), seed=0, judge=judge)
     assert set(same) == {"fid", "kid", "number"}
@@ -228,12 +230,14 @@ def test_sets_are_near_when_equal_and_compared_at_equal_numbers_and_repeatably(j
 
 def test_copies_of_one_window_have_no_diversity(judge: Judge) -> None:
     states = people(30) + 0.05 * torch.randn(30, HORIZON, 42, generator=torch.Generator().manual_seed(2))
+    sets = script("mocap_distances")
+    diversity = sets.diversity
     assert diversity(states[:1].repeat(5, 1, 1), seed=0, judge=judge) == pytest.approx(0, abs=1e-4)
     assert diversity(states, seed=0, judge=judge) > 0.05
     within = {"one": states[:1].repeat(4, 1, 1), "other": states, "single": states[:1]}
-    assert measures.multimodality(within, seed=0, judge=judge) > 0
+    assert sets.multimodality(within, seed=0, judge=judge) > 0
     with pytest.raises(UserError, match="two windows or more of some goal"):
-        measures.multimodality({"single": states[:1]}, seed=0, judge=judge)
+        sets.multimodality({"single": states[:1]}, seed=0, judge=judge)
     with pytest.raises(UserError, match="two windows or more, found 1"):
         diversity(states[:1], seed=0, judge=judge)
 
@@ -242,6 +246,7 @@ def test_what_is_learned_from_generated_motion_is_tested_on_real_motion() -> Non
     def moved(heights: Tensor, count: int, seed: int) -> Tensor:
         return wrists_at(heights) + 0.005 * torch.randn(count, HORIZON, 42, generator=torch.Generator().manual_seed(seed))
 
+    learned_elsewhere = script("mocap_distances").learned_elsewhere
     up, low = torch.linspace(-0.3, 0.4, HORIZON), torch.full((HORIZON,), -0.3)
     generated = {"raise": moved(up, 20, 0), "stand": moved(low, 20, 1)}
     assert learned_elsewhere(generated, {"raise": moved(up, 8, 2), "stand": moved(low, 8, 3)}) == 1

@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from ftl_lightning.methods.ftl_igm.codes import Codes
+from ftl_lightning.methods.ftl_igm.pretraining import Codes
 from ftl_lightning.services.errors import UserError
 
 TEXTS = torch.randn(40, 24, generator=torch.Generator().manual_seed(1))

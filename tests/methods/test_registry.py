@@ -7,9 +7,8 @@ import torch
 
 from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.igm.settings import AdapterOptions
+from ftl_lightning.methods.adaptation import FineTuning, LanguageAdaptation
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
-from ftl_lightning.methods.language.adaptation import LanguageAdaptation
-from ftl_lightning.methods.lora.adaptation import FineTuning
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.training.adaptation import Adaptation, LearnerAdaptation
 from ftl_lightning.training.concept_model import ConceptModel

@@ -12,10 +12,9 @@ from ftl_lightning.data.features import Feature
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.igm.settings import BudgetOptions
-from ftl_lightning.methods.bc.pretraining import CloningPretraining
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.methods.ftl_igm.pretraining import LossOptions, PretrainingModule
-from ftl_lightning.methods.in_context.pretraining import InContextPretraining
+from ftl_lightning.methods.pretraining import CloningPretraining, InContextPretraining
 from ftl_lightning.networks.image_encoder import ImageEncoder, ImageEncoders, SpatialSoftmax
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.randomness import generator

@@ -14,12 +14,12 @@ from ftl_lightning.evaluation.results import read_rows
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.igm.samplers import Sampling
+from ftl_lightning.methods.adaptation import LanguageAdaptation
 from ftl_lightning.methods.bases import StepConfig, added, unroll
-from ftl_lightning.methods.bc.model import CloningConfig, CloningModel, ParallelMLP
-from ftl_lightning.methods.cvae.model import VAEConfig, VAEModel
-from ftl_lightning.methods.in_context.model import InContextConfig, InContextModel
-from ftl_lightning.methods.in_context.pretraining import InContextPretraining
-from ftl_lightning.methods.language.adaptation import LanguageAdaptation
+from ftl_lightning.methods.bc import CloningConfig, CloningModel, ParallelMLP
+from ftl_lightning.methods.cvae import VAEConfig, VAEModel
+from ftl_lightning.methods.in_context import InContextConfig, InContextModel
+from ftl_lightning.methods.pretraining import InContextPretraining
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.randomness import generator
 from ftl_lightning.training.adaptation import LearnerAdaptation

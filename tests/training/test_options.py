@@ -19,8 +19,7 @@ from ftl_lightning.igm.settings import (
     ModeOptions,
 )
 from ftl_lightning.methods.ftl_igm import pretraining
-from ftl_lightning.methods.ftl_igm.codes import Codes
-from ftl_lightning.methods.ftl_igm.pretraining import PRETRAINING, PretrainingModule
+from ftl_lightning.methods.ftl_igm.pretraining import PRETRAINING, Codes, PretrainingModule
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.validation import flat, groups_of, replaced
 from tests.conftest import CONF, inversion_module

@@ -18,7 +18,7 @@ from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.driving.domain import DOMAIN
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
-from ftl_lightning.methods.in_context.model import InContextModel
+from ftl_lightning.methods.in_context import InContextModel
 from ftl_lightning.networks.text_encoder import load_encoder
 from ftl_lightning.reporting.paired import episodes
 from ftl_lightning.services.randomness import DEMONSTRATION_SEED

@@ -1,19 +1,23 @@
-"""Leaderboard page from a folder of submissions."""
+"""Leaderboard page from a folder of submissions, with reference lines: committed scores, which no submission changes."""
 
+import dataclasses
+import json
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
 from ftl_lightning.apps.benchmark.check import check_submission
-from ftl_lightning.apps.benchmark.references import References
 from ftl_lightning.apps.benchmark.submission import GIVEN, PRETRAINED, Run, Score, Submission, score
 from ftl_lightning.apps.benchmark.suite import BenchmarkSuite, load_suite, suite_names
-from ftl_lightning.services.errors import require
+from ftl_lightning.services.errors import about, require
 from ftl_lightning.services.shipped import list_models, pretrained_folder
-from ftl_lightning.services.tensor_file import file_hash, visible
+from ftl_lightning.services.tensor_file import file_hash, visible, write_text
 from ftl_lightning.services.text import markdown
+from ftl_lightning.services.validation import from_mapping, read_json
 from ftl_lightning.training.model_folder import WEIGHTS
 
+FILE = Path(__file__).parent / "references.json"
 BEGIN, END = "<!-- leaderboard: begin -->\n", "<!-- leaderboard: end -->\n"
 MARK = "≈"  # mark of methods whose numbers cannot be recomputed to the digit
 HEAD = """# Leaderboard
@@ -22,6 +26,47 @@ This page is made by `ftl-lightning benchmark --leaderboard docs/leaderboard.md`
 each of which passes `benchmark --check`. Reference lines, in italics, were computed by this package; no submission changes them.
 [The protocol](benchmark.md) says what the numbers mean and how to add a line.
 """
+
+
+@dataclass(frozen=True, kw_only=True)
+class References:
+    """Scores of reference policies.
+
+    Attributes:
+        version, machine: version of ftl-lightning and machine on which they were computed.
+        suites: hashes of the suites' definitions by name.
+        scores: scores by suite, reference policy and measure; without measures that a policy lacks.
+    """
+
+    version: str
+    machine: Mapping[str, str]
+    suites: Mapping[str, str]
+    scores: Mapping[str, Mapping[str, Mapping[str, Score]]]
+
+    @classmethod
+    def load(cls) -> "References":
+        """Read the committed file."""
+        with about(FILE):
+            return from_mapping(cls, read_json(FILE, "references"), "")
+
+    def save(self, path: Path) -> None:
+        """Write the file atomically."""
+        write_text(path, json.dumps(dataclasses.asdict(self), indent=1, ensure_ascii=False) + "\n")
+
+    @classmethod
+    def of(cls, run: Submission) -> "References":
+        """References that a run of this package measured beside its method."""
+        scores: dict[str, dict[str, dict[str, Score]]] = {}
+        for name in sorted(run.suites):
+            suite, runs = load_suite(name), [entry for entry in run.runs if entry.suite == name]
+            for line in sorted(set.intersection(*(set(entry.references) for entry in runs))):
+                rows = [entry.references[line] for entry in runs]
+                measured = set.intersection(*({*row.measures} for seed_rows in rows for row in seed_rows))
+                scores.setdefault(name, {})[line] = {
+                    measure: score(suite, rows, measure) for measure in suite.measures if measure in measured
+                }
+        suites = {name: run.suites[name] for name in scores}
+        return cls(version=run.version, machine=run.machine, suites=suites, scores=scores)
 
 
 def suite_table() -> str:

@@ -12,6 +12,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from ftl_lightning.domains.recorder import reached
 from ftl_lightning.services.randomness import task_key
 
 STEPS = 40  #: Number of points of a stroke.
@@ -27,8 +28,8 @@ Shape = Callable[[Points], Points]
 def corners(*points: tuple[float, float]) -> Shape:
     """Polyline through points at an even pace."""
     corner = np.array(points)
-    reached = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(corner, axis=0), axis=1))))
-    return lambda s: np.stack([np.interp(s * reached[-1], reached, corner[:, axis]) for axis in (0, 1)], axis=-1)
+    along = reached(corner)
+    return lambda s: np.stack([np.interp(s * along[-1], along, corner[:, axis]) for axis in (0, 1)], axis=-1)
 
 
 def polar(radius: Points, angle: Points) -> Points:

@@ -1,9 +1,7 @@
 """Films as JSON for the page: demonstrations, and samples of mixed concepts, judged if the domain has metrics."""
 
 import functools
-import operator
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -30,20 +28,6 @@ Json = dict[str, Any]
 STEPS = 10  # maximum number of sampling steps, so that a moving slider is answered at once
 PARTS = "parts"  # name of the judgement that no part of a path is missing
 JOINED = " and "  # separator of the names of mixed concepts, for domains that read the result as a goal
-
-
-@dataclass(frozen=True)
-class Mixture:
-    """Weighted concepts of a mixture, their names, and demonstrations of those learned here."""
-
-    concepts: Sequence[Composition]
-    names: Sequence[str]
-    examples: Sequence[Demonstrations] = ()
-
-    @property
-    def mixed(self) -> Composition:
-        """Sum of the concepts."""
-        return functools.reduce(operator.add, self.concepts)
 
 
 def sampling_of(model: FewShot, temperature: float | None = None) -> dict[str, Any]:
@@ -106,24 +90,27 @@ def judged(model: ConceptModel, domain: Domain, plans: Demonstrations, goal: str
     return films(domain, plans, right.tolist()), f"{float(right.float().mean()):.0%} right ({name.replace('_', ' ')}: {goal})"
 
 
-def samples(model: FewShot, mixture: Mixture, asked: Sample, tasks: Sequence[str]) -> tuple[list[Json], str, Sampled]:
-    """Generate samples of a mixture, or episodes that execute it: films, the judgement in words, and the settings of sampling.
-    Initial states are of the first of ``tasks`` that the domain reads. Raise UserError for a task that it does not read, or if
+def samples(
+    model: FewShot, mixed: Composition, names: Sequence[str], examples: Sequence[Demonstrations], asked: Sample, task: str
+) -> tuple[list[Json], str, Sampled]:
+    """Generate samples of concepts ``mixed``, or episodes that execute them: films, the judgement in words, and the settings of
+    sampling. ``names`` are those of the concepts, ``examples`` the demonstrations of those learned here. Initial states are of the
+    first of the asked task, ``task`` and ``names`` that the domain reads. Raise UserError for a task that it does not read, or if
     behaviour cannot be executed.
     """
-    judge = judge_of(model, mixture.examples)
+    judge = judge_of(model, examples)
     if asked.task:
         judge.check_goal(asked.task, "task")
     how = sampling_of(model, asked.temperature)
-    task, starts = starts_of(model, (asked.task, *tasks), asked.count, asked.seed)
-    goal = goal_of(judge, mixture.names, asked.task)
+    task, starts = starts_of(model, (asked.task, task, *names), asked.count, asked.seed)
+    goal = goal_of(judge, names, asked.task)
     if not asked.execute:
-        plans = model.sample(mixture.mixed, asked.count, starts, seed=asked.seed, **how)
+        plans = model.sample(mixed, asked.count, starts, seed=asked.seed, **how)
         played, verdict = judged(model.model, judge, plans, goal)
     elif starts is None:
         raise UserError(f"execute: expected a model whose behaviour is executed, found {model.domain.name}")
     else:
-        done = model.execute(mixture.mixed, starts, goal, seed=asked.seed, **how)
+        done = model.execute(mixed, starts, goal, seed=asked.seed, **how)
         outcomes: Mapping[str, Tensor] = model.domain.judge(goal, done.rollout) if goal else {}
         played = episode_films(model.domain, done.rollout, outcomes)
         verdict = ", ".join(f"{name} {value:.2f}" for name, value in done.outcomes.items())

@@ -4,7 +4,6 @@ import base64
 import gzip
 import itertools
 import json
-import re
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -25,6 +24,7 @@ from ftl_lightning.services.errors import about, require, short
 from ftl_lightning.services.files import check_readable
 from ftl_lightning.services.shipped import FILM, MODELS
 from ftl_lightning.services.tensor_file import bytes_hash, kind_of, visible, write_text
+from ftl_lightning.services.text import filled
 from ftl_lightning.training.model_folder import find_model
 
 HERE = Path(__file__).parent
@@ -55,8 +55,7 @@ def page(nonce: str, offline: bytes | None = None) -> str:
         "CSP": "" if offline is None else meta,
         "OFFLINE": "" if offline is None else base64.b64encode(offline).decode(),
     }
-    template = (HERE / "page.html").read_text(encoding="utf-8")
-    return re.sub(f"%({'|'.join(parts)})%", lambda match: parts[match[1]], template)
+    return filled((HERE / "page.html").read_text(encoding="utf-8"), parts)
 
 
 def request_key(path: str, body: Any = None) -> str:

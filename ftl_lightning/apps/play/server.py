@@ -1,9 +1,10 @@
-"""Serve a page on this machine until the user ends the program: access control, errors and the server."""
+"""Serve a page on this machine until the user ends the program: access control, limits of connections, errors and the server."""
 
 import asyncio
 import contextlib
 import hmac
 import ipaddress
+import json
 import secrets
 import socket
 import webbrowser
@@ -20,8 +21,8 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from ftl_lightning.apps.play.connections import Connection, Limits
 from ftl_lightning.services.errors import UserError, mistake_of_machine, short
 from ftl_lightning.services.text import line, say
 
@@ -54,6 +55,98 @@ MISTAKES = (
 )
 """Exceptions reported on a single line. Not Exception, which Starlette handles outside of :class:`Guard` and so without headers."""
 Begin = Callable[[], Awaitable[Any]]  # called at the start, while requests are already answered
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Limits of the server.
+
+    Attributes:
+        connections, per_address: maximum number of connections, and of those from one address. A new connection takes the place of
+            the one that has waited longest for a request, and is refused if all are busy.
+        headers, body: maximum seconds to receive the headers of a request, and its body.
+        idle: seconds before a connection without a new request is closed.
+    """
+
+    connections: int = 200
+    per_address: int = 64
+    headers: float = 5.0
+    body: float = 30.0
+    idle: int = 5
+
+
+class Connection(H11Protocol):
+    """Connection of the server :mod:`uvicorn` with :class:`Limits`. Names of methods are those of uvicorn."""
+
+    limits = Limits()
+    _timer: asyncio.TimerHandle | None = None
+    _since = 0.0
+
+    @property
+    def busy(self) -> bool:
+        """Whether a request is received or answered."""
+        return self.cycle is not None and not self.cycle.response_complete
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Begin to wait for a request, or refuse the connection."""
+        super().connection_made(transport)
+        self._since = self.loop.time()
+        self._timer = self.loop.call_later(self.limits.headers, self._refuse, "408 Request Timeout", "no request in time")
+        known = [other for other in self.connections if isinstance(other, Connection) and other is not self]
+        same = [other for other in known if other._address == self._address]
+        if not (_has_room(same, self.limits.per_address) and _has_room(known, self.limits.connections)):
+            self._refuse("503 Service Unavailable", "too many connections at a time; wait for an answer")
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Forget the connection."""
+        self._stop_timer()
+        super().connection_lost(exc)
+
+    def data_received(self, data: bytes) -> None:
+        """Receive a part of a request: headers in limited time, however many parts they come in."""
+        if self._timer is None and not self.busy:
+            self._timer = self.loop.call_later(self.limits.headers, self._refuse, "408 Request Timeout", "headers took too long")
+        super().data_received(data)
+        if self.busy:
+            self._stop_timer()
+
+    def on_response_complete(self) -> None:
+        """Begin to wait for the next request."""
+        self._since = self.loop.time()
+        super().on_response_complete()
+
+    @property
+    def _address(self) -> str:
+        return self.client[0] if self.client else ""
+
+    def _stop_timer(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+
+    def _refuse(self, status: str, reason: str) -> None:
+        """Close the connection with an answer of one line."""
+        self._stop_timer()
+        self.connections.discard(self)
+        if not self.transport.is_closing():
+            body = json.dumps({"error": reason})
+            head = (
+                f"HTTP/1.1 {status}\r\ncontent-type: application/json\r\ncontent-length: {len(body)}\r\nconnection: close\r\n\r\n"
+            )
+            self.transport.write(f"{head}{body}".encode())
+            self.transport.close()
+
+
+def _has_room(group: Sequence[Connection], most: int) -> bool:
+    """Whether there is room for one more connection; if there are too many, abort the one that has waited longest."""
+    if len(group) < most:
+        return True
+    if not (waiting := [other for other in group if not other.busy]):
+        return False
+    oldest = min(waiting, key=lambda other: other._since)
+    oldest.connections.discard(oldest)
+    oldest.transport.abort()
+    return True
 
 
 class Guard:
@@ -121,7 +214,7 @@ def guarded(
     hosts: Sequence[str],
     end: Callable[[], None],
     begin: Begin | None = None,
-    limits: Limits = Limits(),  # noqa: B008 (frozen)
+    limits: Limits = Limits(),
 ) -> Starlette:
     """Application of a single page: answer requests that name the token and one of the ``hosts`` (``host:port``), by ``routes`` or
     by ``end``, which ends the program. ``begin`` is called at the start.

@@ -1,5 +1,7 @@
 """Session with a model on the page: demonstrations, learned concepts and samples of mixtures."""
 
+import functools
+import operator
 import tempfile
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -10,7 +12,7 @@ from typing import Any, TypeVar
 
 from ftl_lightning.apps.play import requests
 from ftl_lightning.apps.play.demonstrating import Demonstrating, as_npz
-from ftl_lightning.apps.play.mixing import Json, Mixture, films, goal_of, judge_of, judged, samples, sampling_of, starts_of
+from ftl_lightning.apps.play.mixing import Json, films, goal_of, judge_of, judged, samples, sampling_of, starts_of
 from ftl_lightning.apps.play.same import VARIABLES, Learned, Part, Sampled, command, python
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.few_shot.learned_concept import LearnedConcept, Learning
@@ -285,8 +287,8 @@ class Workspace:
             if (shown_here := item.demonstrations) is not None:
                 examples.append(replace(shown_here, concepts=(item.name,) * len(shown_here)))
         names = [item.name for item in known]
-        mixture = Mixture(concepts, names, examples)
-        shown, verdict, how = samples(self._model, mixture, request, (self._demonstrating.task, *names))
+        mixed = functools.reduce(operator.add, concepts)
+        shown, verdict, how = samples(self._model, mixed, names, examples, request, self._demonstrating.task)
         return {"samples": shown, "told": verdict, "seconds": round(monotonic() - begin, 3), "same": self._same(parts, how)}
 
     def _samples(self, concept: LearnedConcept, count: int, demonstrations: Demonstrations) -> tuple[list[Json], str]:

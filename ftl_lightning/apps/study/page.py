@@ -3,7 +3,6 @@
 import base64
 import html
 import json
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,7 @@ from ftl_lightning.domains.films import ABOVE, Wireframe, seen, window
 from ftl_lightning.evaluation.pictures import frame_milliseconds, gif
 from ftl_lightning.services.errors import UserError, require, short
 from ftl_lightning.services.tensor_file import bytes_hash, content_hash, write_text
-from ftl_lightning.services.text import line, plain, script_json
+from ftl_lightning.services.text import filled, line, plain, script_json
 from ftl_lightning.services.validation import read_json
 
 PAGE, KEY = "study.html", "key.json"
@@ -144,6 +143,4 @@ def _html(content: Mapping[str, Any]) -> str:
         "SCRIPT": (HERE / "page.js").read_text(encoding="utf-8"),
         "DATA": script_json(content),
     }
-    template = (HERE / "page.html").read_text(encoding="utf-8")
-    # A single pass does not replace within inserted text, so that a title '%DATA%' is kept.
-    return re.sub(f"%({'|'.join(parts)})%", lambda match: parts[match[1]], template)
+    return filled((HERE / "page.html").read_text(encoding="utf-8"), parts)

@@ -5,7 +5,7 @@ study.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -42,27 +42,34 @@ class ListedFilm:
     row: int = -1
 
 
-@dataclass(frozen=True)
-class Film:
-    """Behaviour shown to raters.
+@dataclass(frozen=True, kw_only=True)
+class FilmSource:
+    """Source of a film, as in the key.
 
     Attributes:
         setting: :data:`TRAINING` or :data:`NEW`, or another name from a listing.
         scenario: unit of comparison between methods: a concept and an initial state.
         concept: text shown to raters.
         method: method that generated the behaviour, or a key of :data:`CHECKS`.
-        states: ``(time, state)`` in the domain's units.
         file, row, hash: source of the behaviour, and hash of the file.
+        still: whether only the first state is shown.
     """
 
     setting: str
     scenario: str
     concept: str
     method: str
-    states: Tensor
     file: str
     row: int
     hash: str
+    still: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Film(FilmSource):
+    """Behaviour shown to raters, with its states ``(time, state)`` in the domain's units."""
+
+    states: Tensor
 
 
 def read_films(folder: Path, domain: Domain, scenarios: int, seed: int) -> list[Film]:
@@ -235,5 +242,5 @@ def whether(concept: str) -> str:
 
 
 def _source(film: Film, still: bool) -> dict[str, Any]:
-    source = {name: getattr(film, name) for name in ("setting", "scenario", "concept", "method", "file", "row", "hash")}
+    source = {field.name: getattr(film, field.name) for field in fields(FilmSource) if field.name != "still"}
     return source | ({"still": True} if still else {})

@@ -13,9 +13,10 @@ from rich.table import Table
 from scipy.stats import binomtest
 
 from ftl_lightning.apps.study.page import FORMAT, KEY_KIND
-from ftl_lightning.apps.study.questions import BEST, CHECK, DEPICTS, NEW, NO, REPEAT, TRAINING, YES
+from ftl_lightning.apps.study.questions import BEST, CHECK, DEPICTS, NEW, NO, REPEAT, TRAINING, YES, FilmSource
 from ftl_lightning.evaluation.summary import literal
 from ftl_lightning.services.errors import UserError, about, require, short, shown
+from ftl_lightning.services.tensor_file import check_kind
 from ftl_lightning.services.text import line
 from ftl_lightning.services.validation import from_mapping, read_json
 
@@ -39,20 +40,6 @@ class Question:
     expected: str = ""
     scenario: str = ""
     setting: str = ""
-
-
-@dataclass(frozen=True)
-class FilmSource:
-    """Source of a film; ``still`` if only its first state is shown."""
-
-    setting: str
-    scenario: str
-    concept: str
-    method: str
-    file: str
-    row: int
-    hash: str
-    still: bool = False
 
 
 @dataclass(frozen=True)
@@ -84,13 +71,8 @@ class Rater:
 
 
 def _json(path: Path, kind: str) -> dict[str, Any]:
-    content = read_json(path, f"a {kind} file")
-    actual = content.get("kind") if isinstance(content, dict) else None
-    description = f"a {short(str(actual))} file" if actual else "a file of other software"
-    require(actual == kind, str(path), f"a {kind} file", description)
-    version = content.get("format")
-    require(version == FORMAT, f"{path}: key 'format'", str(FORMAT), f"{shown(version)}; it is of another version")
-    return dict(content)
+    with about(path):
+        return check_kind(read_json(path, f"a {kind} file"), kind, FORMAT)
 
 
 def read_key(path: Path) -> Key:

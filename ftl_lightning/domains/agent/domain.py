@@ -10,16 +10,21 @@ from ftl_lightning.data.distances import path_distance
 from ftl_lightning.data.features import InitialStates, Observed, check_starts
 from ftl_lightning.domains.agent import scenes
 from ftl_lightning.domains.agent.expert import NAME, SPEED, STATE_NAMES, STATE_UNITS, Expert, demonstrate, environment
-from ftl_lightning.domains.agent.tasks import PUBLISHED, SUITES, TRAINING_CONCEPTS
-from ftl_lightning.domains.comparison import Comparison, Paper
+from ftl_lightning.domains.comparison import Comparison, Paper, published
 from ftl_lightning.domains.domain import ACCURACY, Concepts, Domain, Metric, Plans, Recordings, View, deferred
 from ftl_lightning.domains.execution import ClosedLoop, Rollout
 from ftl_lightning.domains.pictures import Show
 from ftl_lightning.domains.recorder import Recorder
+from ftl_lightning.domains.tasks import read_suites, training_suite
 from ftl_lightning.services.errors import UserError
 
+HERE = Path(__file__).parent
+SUITES = {"training": training_suite(scenes.TRAINING_CONCEPTS)} | read_suites(HERE / "suites.csv")
+"""``paper``, and ``components`` (each of two learned components alone), are the paper's settings. For tuning: ``validation``, three
+new combinations of colour and shape and three from pretraining, each with a known and two new distractors, by the paper's rule; and
+``compositions``, the same targets as compositions of colour and shape, either or both learned."""
 HORIZON = 128
-RENDERING, STEERING = "ftl_lightning.domains.agent.rendering", "ftl_lightning.domains.agent.steering"
+RENDERING = "ftl_lightning.domains.agent.rendering"
 
 
 def reads(task: str) -> bool:
@@ -117,9 +122,7 @@ _STEPS = View({scenes.OBSERVED: scenes.FEATURE}, observe=lambda observed: observ
 DOMAIN = Domain(
     name=NAME,
     plans=Plans(HORIZON, STATE_NAMES, STATE_UNITS, start_exponent=3.0, resolution=1e-3, views={"steps": _STEPS}),
-    concepts=Concepts(
-        training=TRAINING_CONCEPTS, suites=SUITES, reads=reads, table=Path(__file__).parent / "embeddings.safetensors"
-    ),
+    concepts=Concepts(training=scenes.TRAINING_CONCEPTS, suites=SUITES, reads=reads, table=HERE / "embeddings.safetensors"),
     source=lambda root: Expert(),
     observed={scenes.OBSERVED: scenes.FEATURE},
     metrics={ACCURACY: Metric(progressed)},
@@ -137,15 +140,15 @@ DOMAIN = Domain(
         headline="closed loop success",
         references={"nearest object": _nearest, "random object": _random, "expert (oracle)": _oracle},
         distance=distance,
-        paper=Paper(PUBLISHED, omega="1.6", ours="0.6"),
+        paper=Paper(published(HERE / "published.csv"), omega="1.6", ours="0.6"),
     ),
     recordings=Recordings(
         recorder=Recorder(
             "steer",
             "Lead the agent, the brown dot, to where it should go; each time other objects stand elsewhere.",
-            deferred(f"{STEERING}:scene"),
-            deferred(f"{STEERING}:record"),
-            tuple(dict.fromkeys((*TRAINING_CONCEPTS, *(goal for name in ("paper", "validation") for goal in SUITES[name].goals)))),
+            deferred(f"{RENDERING}:scene"),
+            deferred(f"{RENDERING}:record"),
+            tuple(dict.fromkeys(goal for name in ("training", "paper", "validation") for goal in SUITES[name].goals)),
         )
     ),
 )

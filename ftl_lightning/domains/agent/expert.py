@@ -13,7 +13,6 @@ from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.data.formats.files import cached
 from ftl_lightning.domains.agent import scenes
-from ftl_lightning.domains.agent.tasks import TRAINING_CONCEPTS
 from ftl_lightning.domains.domain import Split
 from ftl_lightning.services.randomness import VALIDATION_SEED
 
@@ -145,7 +144,7 @@ class Expert:
     """Source of expert drives, cached."""
 
     def split(self, name: Split, count: int, seed: int) -> Demonstrations:
-        return demonstrations(TRAINING_CONCEPTS, count, seed if name == "train" else VALIDATION_SEED + seed)
+        return demonstrations(scenes.TRAINING_CONCEPTS, count, seed if name == "train" else VALIDATION_SEED + seed)
 
     def draw(self, task: str, count: int, seed: int, workers: int = 1) -> Demonstrations:
         return demonstrations((task,), count, seed)

@@ -1,18 +1,32 @@
-"""Top-view pictures of plans, and films of episodes by the simulator."""
+"""Top-view pictures of plans, films of episodes, and demonstrations from routes drawn by hand on such pictures."""
 
 from collections.abc import Sequence
 
 import numpy as np
+import torch
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import InitialStates, check_starts
-from ftl_lightning.domains.agent.expert import environment
-from ftl_lightning.domains.agent.scenes import COLOURS, OBSERVED, PLANE, REACH, looks, object_positions
+from ftl_lightning.domains.agent.expert import LENGTH, NAME, SPEED, STOP, Plane, drives, environment, follow, initial_states
+from ftl_lightning.domains.agent.scenes import (
+    COLOURS,
+    OBSERVED,
+    PLANE,
+    REACH,
+    STEP,
+    check_simulator,
+    looks,
+    object_positions,
+    scenes,
+)
 from ftl_lightning.domains.execution import Rollout
 from ftl_lightning.domains.films import Shape, VectorFilm, regular, some, still
 from ftl_lightning.domains.pictures import framed
+from ftl_lightning.domains.recorder import Numbers, Piece, Scene, at_even_steps, reached, smoothed
+from ftl_lightning.services.errors import require
 
 MARKERS = {"cone": "^", "sphere": "o", "bowl": "v", "cube": "s"}  # a bowl is an open triangle pointing down
 CORNERS = {"cone": (3, np.pi / 2), "cube": (4, np.pi / 4)}
@@ -93,3 +107,61 @@ def from_above(world: Tensor, states: Tensor) -> VectorFilm:
     shapes += [Shape("way", agent, AGENT, 0.025), Shape("dots", agent, AGENT, 0.07)]
     (left, right), (low, high) = SEEN
     return VectorFilm(shapes, (left, low, right - left, high - low), STEPS_A_SECOND * len(times) / end)
+
+
+BRAKING = 20
+"""States reserved for braking."""
+LONGEST, SHORTEST = (LENGTH - BRAKING) * STEP * SPEED, 0.1
+"""Maximum and minimum length of a route in metres."""
+BLUR, CORNER = 0.08, 0.04
+"""Standard deviation of the smoothing along the route, and distance between its corners afterwards, in metres."""
+COMPOSITION = "go to red bowl"  # the first of the paper's
+FINE = 0.005
+"""Accuracy in metres of the end of a route before an object."""
+
+
+def scene(task: str, seed: int) -> Scene:
+    """Top-view scene of a task with the agent at its start; for '', of :data:`COMPOSITION`.
+
+    Raises:
+        UserError: without the simulator, or for an invalid task.
+    """
+    check_simulator()
+    world = scenes(task or COMPOSITION, 1, seed)
+    film = from_above(world[0], world[:, :3])
+    x, z = world[0, list(PLANE)].tolist()
+    faster = STEPS_A_SECOND * STEP  # the hand moves at the speed of films
+    agent = Piece("agent", (x, z), (len(film.shapes) - 1,))
+    return Scene(film, (agent,), faster * SPEED, LONGEST / (faster * SPEED), initial_states(world))
+
+
+def record(scene_before: Scene, path: Numbers, seconds: Numbers) -> Demonstrations:
+    """Drive at the expert's speed along the drawn route ``(step, 1, 2)`` in metres, to just before the first object on it.
+
+    The route is clipped to the picture; the speed of drawing is ignored.
+
+    Raises:
+        UserError: for a route shorter than :data:`SHORTEST`, or without the simulator.
+    """
+    assert scene_before.starts is not None  # set by `scene`
+    world = scene_before.starts.observed[OBSERVED]
+    start = world[:, list(PLANE)].double().numpy()
+    lower, upper = np.array(SEEN).T
+    hand = np.concatenate((start, path[:, 0].clip(lower, upper)))
+    length = reached(hand)[-1]
+    require(length >= SHORTEST, "way", f"at least {SHORTEST:g} m", f"{length:.2f} m; lead the agent further")
+    route = _before_objects(smoothed(hand, BLUR), object_positions(world)[0].double().numpy()[:, PLANE])
+    env = environment()
+    try:
+        drive = follow(env, world[0].numpy(), route)
+    finally:
+        env.close()
+    return drives(torch.from_numpy(drive)[None], torch.tensor([len(drive)]), ("",), {"generator": "by hand", "domain": NAME})
+
+
+def _before_objects(way: Plane, objects: Plane) -> Plane:
+    """Corners ``(corner, 2)`` of a route up to contact with an object, at most :data:`LONGEST` metres."""
+    fine = at_even_steps(way, int(np.ceil(reached(way)[-1] / FINE)) + 1)
+    near = (np.linalg.norm(fine[:, None] - objects, axis=-1) < STOP).any(axis=1) | (reached(fine) > LONGEST)
+    free = fine[: int(near.argmax()) if near.any() else None]
+    return at_even_steps(free, int(np.ceil(reached(free)[-1] / CORNER)) + 1)

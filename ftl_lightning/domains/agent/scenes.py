@@ -22,6 +22,7 @@ COLOURS = {"red": (255, 87, 34), "yellow": (217, 191, 119), "purple": (149, 56, 
 """RGB colours of the paper, 0 to 255."""
 SHAPES = ("cone", "sphere", "bowl", "cube")
 TYPES = ("agent", "object 1", "object 2")
+TRAINING_CONCEPTS = ("go to red object", "go to yellow object", "go to bowl", "go to cube")
 
 HEIGHT = 0.102  # of centres above the ground
 AGENT_START = (0.0, HEIGHT, -3.806)

@@ -7,8 +7,7 @@ import math
 import multiprocessing
 import signal
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.driving import traffic
 from ftl_lightning.domains.driving.foresight import FRAMES, VETOES, Beliefs, Worlds, meaning
-from ftl_lightning.domains.driving.scenarios import SCENARIOS, Snapshot, advance, arrived, make, observe, restore, save
+from ftl_lightning.domains.driving.scenarios import SCENARIOS, Snapshot, advance, arrived, imagined, make, observe, restore, save
 from ftl_lightning.services.errors import UserError, require
 from ftl_lightning.services.tensor_file import cache_folder, content_hash, load_tensors, save_tensors
 
@@ -80,7 +79,11 @@ def plan(env: AbstractEnv, name: str) -> int:
     until the budget is spent. The first action of the sequence with the highest return is taken.
     """
     search = SEARCH[name]
-    with _searching(env, search):
+    with imagined(env, search.frequency):
+        if search.sight < math.inf:
+            ego = env.vehicle
+            near = [v for v in env.road.vehicles if v is ego or np.linalg.norm(v.position - ego.position) < search.sight]
+            env.road.vehicles = near
         values = _values(env, name, search, env.get_available_actions(), search.budget)
     return max(values, key=values.__getitem__, default=IDLE)
 
@@ -91,10 +94,10 @@ def plan_blind(env: AbstractEnv, name: str, beliefs: Beliefs, rng: np.random.Gen
     The value of an action is the mean return of its best sequence over the worlds. The best action of tolerated risk is taken, else
     the best action of minimum risk. Beliefs must be updated for this decision.
     """
-    search, actual = SEARCH[name], save(env)
+    search = SEARCH[name]
     actions = list({meaning(env, action): action for action in env.get_available_actions()[::-1]}.values())[::-1]
     totals = dict.fromkeys(actions, 0.0)
-    with _searching(env, replace(search, frequency=FRAMES * env.config["policy_frequency"])):
+    with imagined(env, FRAMES * env.config["policy_frequency"]) as actual:
         for _ in range(BLIND.beliefs):
             restore(env, actual)
             beliefs.draw(rng)
@@ -107,21 +110,6 @@ def plan_blind(env: AbstractEnv, name: str, beliefs: Beliefs, rng: np.random.Gen
         if risks[action] <= BLIND.tolerated:
             return action
     return min(risks, key=lambda action: risks[action])
-
-
-@contextmanager
-def _searching(env: AbstractEnv, search: Search) -> Iterator[None]:
-    """Apply search settings; restore the environment afterwards."""
-    actual, frequency, vehicles = save(env), env.config["simulation_frequency"], env.road.vehicles
-    env.config["simulation_frequency"] = search.frequency
-    if search.sight < math.inf:
-        ego = env.vehicle
-        env.road.vehicles = [v for v in vehicles if v is ego or np.linalg.norm(v.position - ego.position) < search.sight]
-    try:
-        yield
-    finally:
-        env.config["simulation_frequency"] = frequency
-        restore(env, actual)
 
 
 def _values(env: AbstractEnv, name: str, search: Search, first_actions: Sequence[int], budget: int) -> dict[int, float]:

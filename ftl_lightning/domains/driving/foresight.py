@@ -8,8 +8,7 @@ PDM-Closed; Dauner et al., 2023).
 
 import itertools
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +16,7 @@ import numpy as np
 from highway_env.envs.common.abstract import AbstractEnv
 from numpy.typing import NDArray
 
-from ftl_lightning.domains.driving.scenarios import Snapshot, advance, observe, restore, save, scenario
+from ftl_lightning.domains.driving.scenarios import Snapshot, advance, imagined, observe, restore, save, scenario
 from ftl_lightning.domains.driving.traffic import BELIEF, SIMULATION, STEP
 
 
@@ -105,32 +104,23 @@ class Worlds:
         self._after: dict[tuple[Meaning, int], Snapshot | None] = {}
         self._risks: dict[Meaning, float] = {}
         self._worlds: list[Snapshot] = []
-        with self._imagining():
-            actual = save(env)
+        with self._imagined() as actual:
             for _ in range(foresight.beliefs):
                 restore(env, actual)
                 beliefs.draw(rng)
                 self._worlds.append(save(env))
-            restore(env, actual)
             if not foresight.beliefs:
                 self._worlds.append(actual)
 
-    @contextmanager
-    def _imagining(self) -> Iterator[None]:
-        """Use :data:`FRAMES` in sampled worlds; restore the simulation afterwards."""
-        env, actual = self._env, save(self._env)
-        frequency = env.config["simulation_frequency"]
-        if self._foresight.beliefs:
-            env.config["simulation_frequency"] = FRAMES * env.config["policy_frequency"]
-        try:
-            yield
-        finally:
-            env.config["simulation_frequency"] = frequency
-            restore(env, actual)
+    def _imagined(self) -> AbstractContextManager[Snapshot]:
+        """The simulation for a block, with :data:`FRAMES` in sampled worlds."""
+        config = self._env.config
+        sampled = FRAMES * config["policy_frequency"]
+        return imagined(self._env, sampled if self._foresight.beliefs else config["simulation_frequency"])
 
     def state(self, decision: int) -> NDArray[np.float64] | None:
         """State ``(7,)`` after a decision in the first world without a crash; ``None`` if all crash."""
-        with self._imagining():
+        with self._imagined():
             key = self._key(decision)
             for world in range(len(self._worlds)):
                 if (after := self._followed(key, decision, world)) is not None:
@@ -140,7 +130,7 @@ class Worlds:
 
     def risk(self, decision: int) -> float:
         """Share of worlds in which a decision or all its continuations crash."""
-        with self._imagining():
+        with self._imagined():
             key = self._key(decision)
             if key not in self._risks:
                 after = [self._followed(key, decision, world) for world in range(len(self._worlds))]

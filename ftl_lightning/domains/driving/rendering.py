@@ -16,7 +16,7 @@ from ftl_lightning.data.features import InitialStates, check_starts, take
 from ftl_lightning.domains.driving.traffic import NAMES, SCENARIO, TRAFFIC, VEHICLES, check_simulator, decision_seconds
 from ftl_lightning.domains.execution import Rollout
 from ftl_lightning.domains.films import Shape, VectorFilm, still
-from ftl_lightning.domains.pictures import PLAIN, RIGHT, WRONG
+from ftl_lightning.domains.pictures import frame_colours
 from ftl_lightning.services.text import figure_text
 
 MAX_COLUMNS, MAX_PANELS = 4, 8
@@ -93,6 +93,7 @@ def render(states: Tensor, right: Sequence[bool] | None, title: str, starts: Ini
     figure = Figure(figsize=(max(width * columns, 5.0), AREA / width * rows + 0.8), layout="constrained")
     caption = title if len(shown) == len(states) else f"{title} ({len(shown)} of {len(states)} shown)"
     figure.suptitle(figure_text(caption), fontsize=11)
+    colours = frame_colours(len(states), right)
     for number, axes in enumerate(figure.subplots(rows, columns, squeeze=False).flat):
         if number >= len(shown):
             axes.set_axis_off()
@@ -101,7 +102,7 @@ def render(states: Tensor, right: Sequence[bool] | None, title: str, starts: Ini
         vehicles = observed[TRAFFIC].unflatten(0, (VEHICLES, -1)).numpy()
         _draw(axes, NAMES[int(observed[SCENARIO].item())], vehicles, shown[number], windows[number])
         for spine in axes.spines.values():
-            spine.set(color=PLAIN if right is None else RIGHT if right[number] else WRONG, linewidth=1.5)
+            spine.set(color=colours[number], linewidth=1.5)
     figure.legend(handles=LEGEND, loc="outside lower center", ncols=len(LEGEND), frameon=False)
     return figure
 

@@ -3,7 +3,8 @@
 Importing this module registers each scenario with gymnasium as ``ftl/driving-NAME-v0``.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -247,6 +248,18 @@ def restore(env: AbstractEnv, snapshot: Snapshot) -> None:
         thing.__dict__.clear()
         thing.__dict__.update(_copied(attributes))
     env.np_random.bit_generator.state = snapshot.random
+
+
+@contextmanager
+def imagined(env: AbstractEnv, frequency: int) -> Iterator[Snapshot]:
+    """Simulate at a frequency in Hz within the block, from the yielded state, which is restored afterwards."""
+    actual, usual = save(env), env.config["simulation_frequency"]
+    env.config["simulation_frequency"] = frequency
+    try:
+        yield actual
+    finally:
+        env.config["simulation_frequency"] = usual
+        restore(env, actual)
 
 
 def advance(env: AbstractEnv, action: int) -> tuple[float, bool]:

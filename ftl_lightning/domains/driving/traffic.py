@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.data.features import Feature, InitialStates
-from ftl_lightning.domains.comparison import OURS, Published
+from ftl_lightning.domains.comparison import published
 from ftl_lightning.domains.domain import Split
 from ftl_lightning.domains.tasks import EvaluationTask, Suite, training_suite
 from ftl_lightning.services.errors import require
@@ -118,23 +118,5 @@ def training_set(name: Split, count: int, folder: Path | None = None) -> Demonst
     return concatenate(parts)
 
 
-SUCCESS, CRASH = "closed loop success (step veto)", "closed loop crash (step veto)"
-_TABLE = (  # guidance weight, method, success and crash rate (table 'Classifier-free guidance weight choice effect')
-    ("1.2", OURS, 0.18, 0.38),
-    ("1.4", OURS, 0.14, 0.40),
-    ("1.6", OURS, 0.04, 0.48),
-    ("1.8", OURS, 0.10, 0.40),
-    ("learned", OURS, 0.24, 0.32),
-    ("learned", "BC", 0.04, 0.64),
-    ("learned", "CVAE", 0.24, 0.48),
-    ("learned", "in-context", 0.0, 0.16),
-)
-PUBLISHED = (
-    *(
-        Published(NEW, value, omega=omega, metric=metric, method=method)
-        for omega, method, *rates in _TABLE
-        for metric, value in zip((SUCCESS, CRASH), rates, strict=True)
-    ),
-    Published(NEW, 0.14, components=1, metric=SUCCESS),  # table 'Ablation on the number of learned concepts', K = 1
-)
+PUBLISHED = published(Path(__file__).parent / "published.csv")
 """The paper's results, comparable with ours for one-step look-ahead; success is passing the roundabout, crashed or not."""

@@ -1,24 +1,18 @@
-"""Measures of generated motion: kinematic rules of actions, the judge, naturalness, and distance to recordings.
+"""Measures of generated motion: kinematic rules of actions, the judge, and naturalness.
 
 Rules need no training and are calibrated on recordings (docs/experiments-mocap.md): a second opinion beside the judge. Metrics map
-``(goal, states (sample, 32, 42), initial states or None) -> (sample,)``; other measures compare sets of windows by the judge.
+``(goal, states (sample, 32, 42), initial states or None) -> (sample,)``.
 """
 
-import warnings
 from collections.abc import Callable, Mapping
 
 import torch
 from torch import Tensor
-from torchmetrics.image.fid import FrechetInceptionDistance
-from torchmetrics.image.kid import KernelInceptionDistance
 
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.mocap import skeleton
-from ftl_lightning.domains.mocap.features import extremes
-from ftl_lightning.domains.mocap.judge import PARTS, WHOLE, Judge, shipped_judge
+from ftl_lightning.domains.mocap.judge import shipped_judge
 from ftl_lightning.domains.mocap.skeleton import ANKLES, FPS, HIPS, KNEES, L_ANKLE, POSE, R_ANKLE, SHOULDERS, WRISTS, as_joints
-from ftl_lightning.services.errors import require
-from ftl_lightning.services.shipped import check_extra
 
 STRIDE = 0.3  # Minimum ankle distance in metres of a stride; closer ankles are a level pose
 SETTLED = 12  # First frame that is independent of the initial pose; synchrony and arm paths are judged from here
@@ -144,12 +138,11 @@ RULES: Mapping[str, Callable[[Tensor], Tensor]] = {
 }
 """Rules of actions by goal, from windows ``(sample, frame, 42)`` to ``(sample,)`` of bool."""
 
-ENOUGH = 500  # Windows per side above which distances of distributions depend more on motion than on the number of windows
 _RIGID = [skeleton.BONES.index(bone) for bone in skeleton.RIGID]
 
 
 def recognised(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
-    """Whether the shipped judge recognises the goal: ``(sample,)`` of bool, see :meth:`Judge.recognised`."""
+    """Whether the shipped judge recognises the goal: ``(sample,)`` of bool, see :meth:`.Judge.recognised`."""
     return shipped_judge().recognised(goal, states)
 
 
@@ -201,77 +194,3 @@ amplitude_of_hands = _limited("jumping jacks", lambda states: _range(_hands(stat
 amplitude_of_feet = _limited("jumping jacks", lambda states: _range(_feet(states)))
 degrees_turned = _limited("arm circle", lambda states: arm_rotation(states).mean(dim=-1))
 """Parts of rules: vertical range of the hands and range of the feet's sideways distance in metres, mean rotation of the arms."""
-
-
-def distances(generated: Tensor, real: Tensor, seed: int, judge: Judge | None = None) -> dict[str, float]:
-    """Frechet and kernel distance of two sets of windows ``(sample, 32, 42)`` in the features of the judge, by default the shipped.
-
-    The Frechet distance falls with the number of windows even for equal distributions: compare only rows of equal number. A random
-    subset of the larger set, by ``seed``, is compared. A ``UserError`` for a side of fewer than two windows.
-
-    Returns:
-        ``fid``, ``kid`` (times 1,000), and ``number`` of windows per side; below :data:`ENOUGH` the Frechet distance means little.
-    """
-    judge = judge or shipped_judge()
-    number = min(len(generated), len(real))
-    require(number > 1, "distances of motion", "two windows or more on each side", f"{len(generated)} and {len(real)}")
-    draw = torch.Generator().manual_seed(seed)
-    sides = {True: real, False: generated}
-    chosen = {is_real: windows[torch.randperm(len(windows), generator=draw)[:number]] for is_real, windows in sides.items()}
-    values = {}
-    with warnings.catch_warnings(), torch.random.fork_rng(devices=[]):
-        warnings.simplefilter("ignore")  # about the memory of features, which are few
-        torch.manual_seed(seed)
-        frechet = FrechetInceptionDistance(feature=judge)
-        kernel = KernelInceptionDistance(feature=judge, subsets=50, subset_size=min(number, ENOUGH))
-        for name, metric in (("fid", frechet), ("kid", kernel)):
-            for is_real, windows in chosen.items():
-                metric.update(windows, real=is_real)
-            value = metric.compute()
-            values[name] = float(value[0] * 1000 if isinstance(value, tuple) else value)
-    return values | {"number": float(number)}
-
-
-def _mean_distance(features: Tensor, pairs: int, draw: torch.Generator) -> Tensor:
-    """Mean distance of random pairs of different rows."""
-    first = torch.randint(len(features), (pairs,), generator=draw)
-    second = (first + torch.randint(1, len(features), (pairs,), generator=draw)) % len(features)
-    return torch.linalg.vector_norm(features[first] - features[second], dim=-1).mean()
-
-
-def diversity(states: Tensor, seed: int, pairs: int = 200, judge: Judge | None = None) -> float:
-    """Mean distance of random pairs of windows ``(sample, 32, 42)`` in the judge's features; a ``UserError`` for fewer than two."""
-    require(len(states) > 1, "diversity of motion", "two windows or more", len(states))
-    return float(_mean_distance((judge or shipped_judge())(states), pairs, torch.Generator().manual_seed(seed)))
-
-
-def multimodality(states: Mapping[str, Tensor], seed: int, pairs: int = 20, judge: Judge | None = None) -> float:
-    """Mean over goals of :func:`diversity` within a goal, for goals of two windows or more; a ``UserError`` if there is none."""
-    draw, judge = torch.Generator().manual_seed(seed), judge or shipped_judge()
-    means = [_mean_distance(judge(windows), pairs, draw) for windows in states.values() if len(windows) > 1]
-    require(means, "multimodality of motion", "two windows or more of some goal", "none")
-    return float(torch.stack(means).mean())
-
-
-def learned_elsewhere(generated: Mapping[str, Tensor], real: Mapping[str, Tensor]) -> float:
-    """Balanced accuracy on real windows of a linear classifier trained on generated windows ``(sample, 32, 42)`` by class.
-
-    A ``UserError`` for different classes, or fewer than two; without scikit-learn.
-    """
-    check_extra("mocap", "learned_elsewhere")
-    from sklearn.linear_model import LogisticRegression  # a second to import
-
-    names = sorted(generated)
-    same = names == sorted(real) and len(names) > 1
-    both = f"{', '.join(names)} and {', '.join(sorted(real))}"
-    require(same, "train on generated, test on real", "the same two classes or more", both)
-
-    def numbers(windows: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
-        labels = torch.arange(len(names)).repeat_interleave(torch.tensor([len(windows[name]) for name in names]))
-        return extremes(torch.cat([windows[name] for name in names]), PARTS[WHOLE][0]), labels
-
-    (inputs, labels), (tested, right) = numbers(generated), numbers(real)
-    mean, std = inputs.mean(dim=0), inputs.std(dim=0).clamp_min(0.02)
-    classifier = LogisticRegression(C=0.01, max_iter=500).fit(((inputs - mean) / std).clamp(-5, 5).numpy(), labels.numpy())
-    predicted = torch.from_numpy(classifier.predict(((tested - mean) / std).clamp(-5, 5).numpy()))
-    return float(torch.stack([(predicted[right == index] == index).float().mean() for index in range(len(names))]).mean())

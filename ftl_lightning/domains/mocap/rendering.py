@@ -13,6 +13,7 @@ from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.films import Points, Wireframe, drawn, seen
 from ftl_lightning.domains.mocap import skeleton
 from ftl_lightning.domains.mocap.skeleton import BONES, FPS, HIPS, SHOULDERS, as_joints
+from ftl_lightning.domains.pictures import frame_colours
 from ftl_lightning.services.text import figure_text
 
 LEFT, RIGHT, TRUNK = "#0a6fb5", "#d9591c", "#3b3f45"
@@ -53,8 +54,8 @@ def picture(states: Tensor, right: Sequence[bool] | None, title: str, starts: In
     figure = Figure(figsize=(8.2, 1.65 * len(shown) + 0.5), layout="constrained")
     heading = title if len(shown) == len(states) else f"{title} ({len(shown)} of {len(states)} shown)"
     figure.suptitle(figure_text(heading), fontsize=9)
-    frames = ["#8a8a8a"] * len(states) if right is None else ["#2e9e46" if good else "#d03a3a" for good in right]
-    for axes, plan, frame in zip(figure.subplots(len(shown), 1, squeeze=False).flat, shown, frames, strict=False):
+    panels = figure.subplots(len(shown), 1, squeeze=False).flat
+    for axes, plan, frame in zip(panels, shown, frame_colours(len(states), right), strict=False):
         _strip(axes, wireframe(plan), frame)
     for colour, label in ((LEFT, "left"), (RIGHT, "right"), (TRUNK, "trunk")):
         figure.axes[0].plot([], [], color=colour, linewidth=2, label=label)

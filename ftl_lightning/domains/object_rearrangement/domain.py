@@ -7,15 +7,31 @@ from torch import Tensor
 
 from ftl_lightning.data.distances import path_distance
 from ftl_lightning.data.features import InitialStates
-from ftl_lightning.domains.comparison import Comparison, Paper
+from ftl_lightning.domains.comparison import Comparison, Paper, published
 from ftl_lightning.domains.domain import ACCURACY, Concepts, Domain, Generated, Metric, Plans, Recordings, deferred
-from ftl_lightning.domains.object_rearrangement.scenes import PER_SHAPE, SHAPES, generate, holds, parse, random_scenes, sentence
-from ftl_lightning.domains.object_rearrangement.tasks import DESCRIBED, PUBLISHED, SUITES, TRAINING_CONCEPTS
+from ftl_lightning.domains.object_rearrangement.scenes import (
+    PER_SHAPE,
+    SHAPES,
+    TRAINING_RELATIONS,
+    generate,
+    holds,
+    parse,
+    random_scenes,
+    sentence,
+)
 from ftl_lightning.domains.pictures import Show
 from ftl_lightning.domains.recorder import Recorder
+from ftl_lightning.domains.tasks import read_suites, training_suite
 from ftl_lightning.services.errors import UserError
 
 NAME = "object_rearrangement"
+HERE = Path(__file__).parent
+TRAINING_CONCEPTS = tuple(map(str, TRAINING_RELATIONS))
+SUITES = {"training": training_suite(TRAINING_CONCEPTS)} | read_suites(HERE / "suites.csv")
+"""``paper``, and ``components`` (each of two learned components alone), are the paper's settings. For tuning: ``validation``, and
+``compositions``: two of its learned concepts, a ring and a training concept, three training concepts (no two form a task of the
+paper), and a training concept without another that would often hold by chance."""
+DESCRIBED = ("training", "paper", "components", "validation")  # parts of compositions are in these suites
 STATE_NAMES = tuple(
     f"{shape}.{column}" for shape in SHAPES for column in ("x", "y", "radius", "angle", *(f"is_{kind}" for kind in SHAPES))
 )
@@ -52,10 +68,10 @@ DOMAIN = Domain(
     concepts=Concepts(
         training=TRAINING_CONCEPTS,
         suites=SUITES,
-        descriptions=DESCRIBED,
+        descriptions=tuple(dict.fromkeys(goal for name in DESCRIBED for goal in SUITES[name].goals)),
         reads=reads,
         sentence=sentence,
-        table=Path(__file__).parent / "embeddings.safetensors",
+        table=HERE / "embeddings.safetensors",
     ),
     source=lambda root: Generated(NAME, PLANS, TRAINING_CONCEPTS, lambda task, count, seed: generate(task, count, seed)[:, None]),
     metrics={ACCURACY: Metric(succeeded)},
@@ -66,7 +82,7 @@ DOMAIN = Domain(
             "generator (oracle)": lambda goal, count, starts, seed: generate(goal, count, seed)[:, None],
         },
         distance=distance,
-        paper=Paper(PUBLISHED, omega="1.2", ours="1.2"),
+        paper=Paper(published(HERE / "published.csv"), omega="1.2", ours="1.2"),
     ),
     recordings=Recordings(
         recorder=Recorder(

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ftl_lightning.domains.recorder import reached
 from ftl_lightning.domains.tabletop.interface import AROUND_BOWL, MAX_STEPS, OPEN, PUSH_ON_BOOK, PUSHES, TO_BOOK, TO_WHITE
 from ftl_lightning.domains.tabletop.scenes import (
     APART,
@@ -101,8 +102,7 @@ def around(circle: Place, goal: Place, bowl: Place) -> Place:
     angles = first + side * np.linspace(0, sweep, max(2, int(RING * sweep / 0.005)))
     arc = bowl + RING * np.stack((np.cos(angles), np.sin(angles)), axis=-1)
     path = np.concatenate((circle[None], arc, goal[None]))
-    travelled = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))))
-    return np.array([np.interp(AHEAD, travelled, column) for column in path.T])
+    return np.array([np.interp(AHEAD, reached(path), column) for column in path.T])
 
 
 def _tangent(centre: Place, place: Place, turn: float) -> float:

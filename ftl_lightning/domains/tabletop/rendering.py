@@ -12,10 +12,10 @@ from torch import Tensor
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.execution import Rollout
 from ftl_lightning.domains.films import Shape, VectorFilm, some, still
+from ftl_lightning.domains.pictures import framed
 from ftl_lightning.domains.tabletop.interface import FRONT, HERTZ, POSE, THRESHOLD, check_simulator
 from ftl_lightning.domains.tabletop.scenes import BOOK, CIRCLE, COLUMNS, HEIGHT, OBJECTS, SIGHT, WHITE, outline, outlines, support
 from ftl_lightning.domains.tabletop.world import ARM, COLOUR, FINGERS, TABLE_COLOUR
-from ftl_lightning.services.text import figure_text
 
 MAX_COLUMNS = 4
 FRAMES = 60  # Maximum number of frames of an episode
@@ -24,21 +24,14 @@ _OPEN, _CLOSED = (0, 150, 255), (255, 0, 90)  # Colours of a plan's states in a 
 
 def render(states: Tensor, right: Sequence[bool] | None, title: str, starts: InitialStates | None) -> Figure:
     """Tables from above with the hand's paths of plans ``(sample, horizon, 4)``; frames are green, red, or grey for ``None``."""
-    columns = min(len(states), MAX_COLUMNS)
-    rows = -(-len(states) // columns)
-    figure = Figure(figsize=(2.2 * columns, 1.8 * rows + 0.4), layout="constrained")
-    figure.suptitle(figure_text(title), fontsize=9)
-    frames = ["#8a8a8a"] * len(states) if right is None else ["#2e9e46" if good else "#d03a3a" for good in right]
-    grid = list(figure.subplots(rows, columns, squeeze=False).flat)
-    for number, (axes, plan) in enumerate(zip(grid, states, strict=False)):
+    figure = framed(len(states), right, title, MAX_COLUMNS, (2.2, 1.8))
+    for number, (axes, plan) in enumerate(zip(figure.axes, states, strict=False)):
         scene = None if starts is None or starts.scenes is None else starts.scenes[number].numpy()
-        _table(axes, plan.cpu().numpy(), scene, frames[number])
-    for axes in grid[len(states) :]:
-        axes.set_axis_off()
+        _table(axes, plan.cpu().numpy(), scene)
     return figure
 
 
-def _table(axes: Axes, plan: NDArray[np.float32], scene: NDArray[np.float32] | None, frame: str) -> None:
+def _table(axes: Axes, plan: NDArray[np.float32], scene: NDArray[np.float32] | None) -> None:
     placed = {} if scene is None else outlines(scene)
     for name in sorted(placed, key=(BOOK, WHITE).__contains__, reverse=True):  # objects on the book are drawn after it
         points = placed[name][:, ::-1]  # y to the left and x up, as the camera sees it
@@ -46,9 +39,7 @@ def _table(axes: Axes, plan: NDArray[np.float32], scene: NDArray[np.float32] | N
     axes.plot(plan[:, 1], plan[:, 0], color="#d0006f", linewidth=1.2)
     axes.plot(plan[0, 1], plan[0, 0], "o", color="#d0006f", markersize=3)
     (low, high), (right, left) = SIGHT
-    axes.set(xlim=(left, right), ylim=(low, high), xticks=[], yticks=[], aspect="equal", facecolor="#d9cfc0")
-    for spine in axes.spines.values():
-        spine.set(color=frame, linewidth=2.0)
+    axes.set(xlim=(left, right), ylim=(low, high), facecolor="#d9cfc0")
 
 
 def film(rollout: Rollout, plans: Tensor) -> list[NDArray[np.uint8]]:

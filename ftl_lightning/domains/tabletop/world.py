@@ -46,8 +46,6 @@ FINGERS = (9, 10)
 TIP = 11  # Link between the fingertips, 7 mm above their ends
 REST = (0.0, 0.1, 0.0, -2.4, 0.0, 2.5, 0.785)  # Initial joint angles of inverse kinematics
 
-Pose = tuple[tuple[float, float, float], tuple[float, float, float, float]]  # Position, and quaternion with its real part last
-
 
 @dataclass(frozen=True)
 class Bodies:

@@ -15,7 +15,7 @@ from ftl_lightning.igm.diffusion import MOST_STEPS, PREDICTIONS, Context, Predic
 from ftl_lightning.igm.forms.adapter import LowRank, adaptable
 from ftl_lightning.igm.model import DiffusionModel, Draws
 from ftl_lightning.igm.samplers import Sampling
-from ftl_lightning.methods.ftl_igm import METHOD
+from ftl_lightning.methods.declared import FTL_IGM
 from ftl_lightning.services.errors import require, short
 from ftl_lightning.services.spectrum import Spectrum, check_cosines
 from ftl_lightning.services.validation import check_range, from_mapping
@@ -73,7 +73,7 @@ def build_denoiser(config: DiffusionConfig) -> nn.Module:
 class GenerativeModel(DiffusionModel, TextConceptModel):
     """Conditional diffusion model of plans."""
 
-    method = METHOD
+    method = FTL_IGM
     invertible = True
     Config = DiffusionConfig
     config: DiffusionConfig

@@ -1,5 +1,6 @@
-"""Pretraining of the denoiser: Eq. 1 of the paper."""
+"""Pretraining of the denoiser: Eq. 1 of the paper, with coarse codes of behaviour, for concepts that vary over a plan."""
 
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -8,11 +9,10 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.igm.diffusion import LARGEST_POWER, LOSSES, MOST_STEPS, Prediction, denoising_loss, loss_weights, timesteps
-from ftl_lightning.methods.ftl_igm.codes import Codes
 from ftl_lightning.methods.ftl_igm.model import DiffusionConfig, GenerativeModel
 from ftl_lightning.networks import PAPER_SIZE
 from ftl_lightning.services.errors import UserError, short
-from ftl_lightning.services.randomness import drawn
+from ftl_lightning.services.randomness import drawn, generator, mean
 from ftl_lightning.services.validation import MOST_TOGETHER, check_count, check_factor, check_range, flat, groups_of
 from ftl_lightning.training.data import Batch, PretrainingData
 from ftl_lightning.training.model_config import ModelConfig, Prepared
@@ -58,6 +58,57 @@ class LossOptions:
         check_range("model.loss.condition_dropout", self.condition_dropout, 0, 1)
         check_factor("model.loss.timestep_power", self.timestep_power, 1, LARGEST_POWER)
         check_range("model.loss.discount", self.discount, 0, 1)
+
+
+@dataclass(frozen=True)
+class Codes:
+    """Coarse codes of behaviour, added to the text embeddings of some samples in pretraining.
+
+    A code is a random linear projection of the plan's states at several knots, with noise. Its average length is that of a text
+    embedding, and half of the samples with a code have no text.
+
+    Attributes:
+        share: share of samples with a code, excluding samples with dropped text, which stay unconditional. 0 is the paper's form.
+        knots: number of times.
+        size: number of values per knot.
+        noise: standard deviation of the noise added to the values, which have unit variance.
+        relative: encode displacements from the first state; otherwise positions. Concepts of positions lead to the same places
+            from any initial state.
+    """
+
+    share: float = 0.0
+    knots: int = 8
+    size: int = 16
+    noise: float = 0.3
+    relative: bool = True
+
+    def __post_init__(self) -> None:
+        check_range("model.codes.share", self.share, 0, 1)
+        check_range("model.codes.noise", self.noise, 0)
+        check_count("model.codes.knots", self.knots, 1, MOST_STEPS)
+        check_count("model.codes.size", self.size, 1, MOST_STEPS)
+
+    def __call__(self, texts: Tensor, removed: Tensor, clean: Tensor, draw: torch.Generator) -> Tensor:
+        """Add codes to text embeddings; returns concepts ``(batch, knots, n)``.
+
+        Args:
+            texts: ``(batch, n)``, unconditional where removed.
+            removed: mask of removed texts ``(batch,)``.
+            clean: plans ``(batch, horizon, state)``, normalised.
+        """
+        count, width, device = *texts.shape, clean.device
+        times = torch.linspace(0, clean.shape[1] - 1, self.knots, device=device).round().long()
+        fixed = generator("cpu", zlib.crc32(b"codes"))
+        mixing = torch.randn(clean.shape[2], self.size, generator=fixed).to(device)
+        directions = torch.randn(self.size, width, generator=fixed).to(device) / self.size**0.5
+        states = clean[:, times] - clean[:, :1] if self.relative else clean[:, times]
+        path = states @ mixing  # (batch, knot, size)
+        numbers = path / mean(path.square().mean()).sqrt().clamp(min=1e-6)
+        numbers = numbers + self.noise * drawn(count, lambda n: torch.randn((n, *path.shape[1:]), generator=draw, device=device))
+        coded = (drawn(count, lambda n: torch.rand(n, generator=draw, device=device)) < self.share) & ~removed
+        alone = coded & (drawn(count, lambda n: torch.rand(n, generator=draw, device=device)) < 0.5)
+        text = torch.where(alone[:, None], 0, texts)  # 0 is the mean of the training concepts
+        return text[:, None] + coded[:, None, None] * (numbers @ directions)
 
 
 _LOSS, _CODES = LossOptions(), Codes()

@@ -13,8 +13,7 @@ import pytest
 import torch
 
 from ftl_lightning.apps.benchmark.check import allowed, check_submission, drawn, shifted
-from ftl_lightning.apps.benchmark.leaderboard import leaderboard, read_submissions
-from ftl_lightning.apps.benchmark.references import References
+from ftl_lightning.apps.benchmark.leaderboard import References, leaderboard, read_submissions
 from ftl_lightning.apps.benchmark.run import Candidate
 from ftl_lightning.apps.benchmark.submission import Row, Run, Submission, scored
 from ftl_lightning.apps.benchmark.suite import load_suite

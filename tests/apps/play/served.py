@@ -22,8 +22,7 @@ import pytest
 
 import ftl_lightning.apps.play.application  # noqa: F401 - before the work of a test is measured
 from ftl_lightning.apps.play import server
-from ftl_lightning.apps.play.connections import Limits
-from ftl_lightning.apps.play.server import Place
+from ftl_lightning.apps.play.server import Limits, Place
 from ftl_lightning.cli.main import main
 from tests.conftest import environment
 

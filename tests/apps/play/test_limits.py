@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from ftl_lightning.apps.play.connections import Limits
+from ftl_lightning.apps.play.server import Limits
 from tests.apps.play.served import Served, here
 
 POST = b"POST /api/undo HTTP/1.1\r\nHost: "

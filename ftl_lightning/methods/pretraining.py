@@ -1,4 +1,4 @@
-"""Pretraining of the in-context model."""
+"""Pretraining of the baselines (paper, 'Baselines' and 'Implementation Details')."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -7,14 +7,105 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from ftl_lightning.data.features import moved
 from ftl_lightning.methods.bases import check_window
-from ftl_lightning.methods.in_context.model import InContextConfig, InContextModel
+from ftl_lightning.methods.bc import CloningConfig, CloningModel
+from ftl_lightning.methods.cvae import VAEConfig, VAEModel
+from ftl_lightning.methods.in_context import InContextConfig, InContextModel
 from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.randomness import drawn
+from ftl_lightning.services.validation import check_range
 from ftl_lightning.training.data import Batch, PretrainingData
 from ftl_lightning.training.method import check_present
 from ftl_lightning.training.model_config import ModelConfig, Prepared
 from ftl_lightning.training.model_folder import load_model
 from ftl_lightning.training.pretraining import Pretraining, check_shown
+
+
+class CloningPretraining(Pretraining[CloningModel]):
+    """Fits the policy to transitions of a domain's pairs of behaviour and concept.
+
+    Args:
+        hidden_dim, members: see :class:`CloningConfig`.
+        plan_horizon: states in an unrolled plan; ``None`` for the domain's.
+        stride: see :class:`~ftl_lightning.methods.bases.StepConfig`; ``data.horizon`` is ``stride + 1``, or 1.
+        options: see :class:`~ftl_lightning.training.pretraining.Pretraining`.
+    """
+
+    def __init__(
+        self, hidden_dim: int = 512, members: int = 1, plan_horizon: int | None = None, stride: int = 1, **options: Any
+    ) -> None:
+        super().__init__(**options)
+        self.save_hyperparameters()
+        check_range("model.hidden_dim", hidden_dim, 1)
+        if plan_horizon is not None:
+            check_range("model.plan_horizon", plan_horizon, 1)
+        self.stride = stride
+
+    def build(self, prepared: Prepared[ModelConfig], data: PretrainingData) -> CloningModel:
+        sizes = {name: self.hparams[name] for name in ("hidden_dim", "members", "stride")}
+        horizon = self.hparams["plan_horizon"] or data.domain.plans.horizon
+        policy = prepared.configured(CloningConfig, horizon=horizon, **sizes)
+        check_window(policy.config, data)
+        return CloningModel(policy)
+
+    def losses(self, model: CloningModel, batch: Batch, draw: torch.Generator) -> Tensor:
+        """Squared error of transitions."""
+        states, seen = batch.states, batch.observed
+        return model.errors(states, seen, model.training_embeddings[batch.concepts])
+
+
+class VAEPretraining(Pretraining[VAEModel]):
+    """Fits encoder and decoder to a domain's behaviour; a training concept is the encoding of its first demonstration.
+
+    Args:
+        latent_dim: size of z.
+        hidden_dim: see :class:`VAEConfig`.
+        beta: weight of the divergence from the prior, per value of the behaviour, relative to the squared error.
+        options: see :class:`~ftl_lightning.training.pretraining.Pretraining`.
+    """
+
+    def __init__(self, latent_dim: int = 20, hidden_dim: int = 512, beta: float = 1.0, **options: Any) -> None:
+        super().__init__(**options)
+        self.save_hyperparameters()
+        check_range("model.latent_dim", latent_dim, 1)
+        check_range("model.hidden_dim", hidden_dim, 1)
+        check_range("model.beta", beta, 0)
+
+    def build(self, prepared: Prepared[ModelConfig], data: PretrainingData) -> VAEModel:
+        latent = self.hparams["latent_dim"]
+        check_shown(prepared.config.training_concepts, data.training.concepts)
+        self._first = data.first_windows()
+        networks = prepared.configured(VAEConfig, concept_dim=latent, hidden_dim=self.hparams["hidden_dim"])
+        return VAEModel(networks.embedded(torch.zeros(len(prepared.embeddings), latent)))
+
+    def losses(self, model: VAEModel, batch: Batch, draw: torch.Generator) -> Tensor:
+        """Negative evidence lower bound per value of the behaviour (Kingma & Welling, 2014)."""
+        states, seen = batch.states, batch.observed
+        mean, log_variance = model.posterior(states, seen)
+        noise = drawn(len(mean), lambda n: torch.randn((n, *mean.shape[1:]), generator=draw, device=mean.device))
+        divergence = 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(dim=-1)
+        numbers = model.config.horizon * model.config.state_dim
+        errors = model.errors(states, seen, mean + (0.5 * log_variance).exp() * noise)
+        return errors + self.hparams["beta"] * divergence / numbers
+
+    def _represent(self) -> None:
+        model = self.model
+        states, _, seen = self._first
+        with torch.no_grad():
+            mean, _ = model.posterior(states.to(self.device), moved(seen, self.device))
+        model.training_embeddings.copy_(mean)
+
+    def on_validation_start(self) -> None:
+        super().on_validation_start()
+        self._represent()
+
+    def on_test_start(self) -> None:
+        self._represent()
+
+    def on_fit_end(self) -> None:
+        self._represent()
+        super().on_fit_end()
 
 
 class InContextPretraining(Pretraining[InContextModel]):

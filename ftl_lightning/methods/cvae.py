@@ -10,7 +10,7 @@ from ftl_lightning.data.features import Observed
 from ftl_lightning.igm.composition import Composition, batched
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.methods.bases import AdditiveModel, added
-from ftl_lightning.methods.cvae import METHOD
+from ftl_lightning.methods.declared import CVAE
 from ftl_lightning.training.model_config import ModelConfig, Prepared
 
 
@@ -28,7 +28,7 @@ class VAEConfig(ModelConfig):
 class VAEModel(AdditiveModel):
     """VAE of behaviour, conditioned on the initial state. A concept is a value of the latent z; composing adds concepts."""
 
-    method = METHOD
+    method = CVAE
     Config = VAEConfig
     config: VAEConfig
 

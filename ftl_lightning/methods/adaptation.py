@@ -1,4 +1,7 @@
-"""Adaptation of our model by language: a concept is the embedding of its description."""
+"""Other adaptations of our model: by language, where a concept is the embedding of its description, and by fine-tuning."""
+
+from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -6,12 +9,13 @@ from torch import Tensor
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import Concept
-from ftl_lightning.methods.language import METHOD
+from ftl_lightning.igm.settings import AdapterOptions
+from ftl_lightning.methods.declared import LANGUAGE
 from ftl_lightning.networks.text_encoder import load_encoder
 from ftl_lightning.services.errors import require
-from ftl_lightning.training.adaptation import Adaptation
+from ftl_lightning.training.adaptation import Adaptation, Labels
 from ftl_lightning.training.concept_model import ConceptModel, TextConceptModel
-from ftl_lightning.training.labels import Labels
+from ftl_lightning.training.inversion_module import InversionModule
 
 
 class LanguageAdaptation(Adaptation):
@@ -31,7 +35,7 @@ class LanguageAdaptation(Adaptation):
         UserError: for a model of another method or encoder.
     """
 
-    labels = Labels(METHOD.name, "", "")
+    labels = Labels(LANGUAGE.name)
 
     def __init__(
         self,
@@ -52,7 +56,7 @@ class LanguageAdaptation(Adaptation):
 
     @classmethod
     def adapts(cls, model: type[ConceptModel]) -> bool:
-        return model.method.kind == METHOD.kind
+        return model.method.kind == LANGUAGE.kind
 
     def _embedding(self, goal: str) -> Tensor:
         """Embed a task's description, ``(1, 1, n)``."""
@@ -70,3 +74,19 @@ class LanguageAdaptation(Adaptation):
         if task.component is not None or not set(task.learned) <= set(self.learned()):
             return None
         return Composition(self._embedding(task.goal), torch.tensor([self._omega], device=self.device))
+
+
+_WHOLE = AdapterOptions(rank=4, scope="all")
+
+
+class FineTuning(InversionModule):
+    """Learns a concept with an adapter of every branch of a composition, including the unconditional.
+
+    Args:
+        pretrained: folder of the pretrained model.
+        adapter: rank and learning rate; the scope is always ``'all'``.
+        options: see :class:`~ftl_lightning.training.inversion_module.InversionModule`.
+    """
+
+    def __init__(self, pretrained: str, adapter: AdapterOptions = _WHOLE, **options: Any) -> None:
+        super().__init__(pretrained, adapter=replace(adapter, scope="all"), **options)
