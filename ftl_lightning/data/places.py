@@ -99,9 +99,9 @@ def places(demonstrations: Demonstrations, horizon: int) -> Places:
         shares = {
             columns: min(
                 (
-                    float((rest.var(dim=0) / values[some].var(dim=0).clamp(min=1e-12)).amax(dim=1).min())
+                    float((rest.var(dim=0) / values[some].var(dim=0)).amax(dim=1).min())
                     for some in rows
-                    if len(some) > 2
+                    if len(some) > 2 and (values[some].var(dim=0) > 1e-12).all()
                     for rest in [paths[some][..., list(columns)] - values[some][:, None]]
                 ),
                 default=float("inf"),
