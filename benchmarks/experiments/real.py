@@ -23,6 +23,7 @@ from pathlib import Path
 from statistics import mean, stdev
 from typing import Any
 
+import numpy as np
 import torch
 from real_data import FEW, FEW_SEED, FRESH_SEED, NAMES, REAL, RULE, RealSet, sets
 from scipy.stats import spearmanr
@@ -149,7 +150,7 @@ def rank(rows: list[dict[str, Any]], printed: str, without: tuple[str, ...] = ()
 
 
 def correlations(rows: list[dict[str, Any]]) -> list[str]:
-    """Table of rank correlations, over all cells and as the mean over sets."""
+    """Table of rank correlations, over all cells and as the mean over sets in which the truth differs."""
     sets = {name: [row for row in rows if row["set"] == name] for name in dict.fromkeys(str(row["set"]) for row in rows)}
     parts: dict[str, tuple[list[str], tuple[str, ...]]] = {
         "all": ([*sets], ()),
@@ -164,11 +165,8 @@ def correlations(rows: list[dict[str, Any]]) -> list[str]:
             continue
         some = [row for name in names for row in sets[name]]
         count = sum(name not in ("chosen", *without) for row in some for name in row["truth"])
-        numbers = [
-            number
-            for printed in PRINTED
-            for number in (rank(some, printed, without), mean(rank(sets[name], printed, without) for name in names))
-        ]
+        within = {printed: [rank(sets[name], printed, without) for name in names] for printed in PRINTED}
+        numbers = [each for printed in PRINTED for each in (rank(some, printed, without), float(np.nanmean(within[printed])))]
         lines.append(f"| {part} | {count} | {' | '.join(f'{number:.2f}' for number in numbers)} |")
     return lines
 
