@@ -143,10 +143,18 @@ def measured(data: RealSet, model: FewShot, kind: str, draw: int) -> dict[str, o
     return {**row, "truth": truth, "score": scores, "look": shape, "skill": skills, "nearer": nearer}
 
 
-def rank(rows: list[dict[str, Any]], printed: str, without: tuple[str, ...] = ()) -> float:
-    """Spearman's rank correlation of what is printed with the truth, over the forms of all cells; the chosen one is among them."""
-    names = [(row, name) for row in rows for name in row["truth"] if name not in ("chosen", *without)]
-    return float(spearmanr([(row[printed][name], row["truth"][name]) for row, name in names]).statistic)
+Pairs = list[tuple[float, float]]
+
+
+def _pairs(rows: list[dict[str, Any]], printed: str, without: tuple[str, ...] = ()) -> Pairs:
+    """What is printed of each form and its truth, over all cells; each form of a cell once."""
+    named = [({**row["truth"], row["form"]: row["truth"]["chosen"]}, row[printed]) for row in rows]
+    return [(said[name], truth[name]) for truth, said in named for name in truth if name not in ("chosen", *without)]
+
+
+def _rank(pairs: Pairs) -> float:
+    """Spearman's rank correlation."""
+    return float(spearmanr(pairs).statistic)
 
 
 def correlations(rows: list[dict[str, Any]]) -> list[str]:
@@ -164,10 +172,11 @@ def correlations(rows: list[dict[str, Any]]) -> list[str]:
         if not names:
             continue
         some = [row for name in names for row in sets[name]]
-        count = sum(name not in ("chosen", *without) for row in some for name in row["truth"])
-        within = {printed: [rank(sets[name], printed, without) for name in names] for printed in PRINTED}
-        numbers = [each for printed in PRINTED for each in (rank(some, printed, without), float(np.nanmean(within[printed])))]
-        lines.append(f"| {part} | {count} | {' | '.join(f'{number:.2f}' for number in numbers)} |")
+        numbers, pairs = [], Pairs()
+        for printed in PRINTED:
+            pairs = _pairs(some, printed, without)
+            numbers += [_rank(pairs), float(np.nanmean([_rank(_pairs(sets[name], printed, without)) for name in names]))]
+        lines.append(f"| {part} | {len(pairs)} | {' | '.join(f'{number:.2f}' for number in numbers)} |")
     return lines
 
 
