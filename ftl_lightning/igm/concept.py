@@ -135,7 +135,7 @@ class Choice:
 
     @property
     def words(self) -> str:
-        """Skill of the form beside the references that need no learning; empty if it was not measured."""
+        """Skill of the form beside references that need no learning, and share of nearer samples; empty if it was not measured."""
         skills = self.skills
         if self.form not in skills:
             return ""
