@@ -20,8 +20,8 @@ from ftl_lightning.services.text import Shown, counted, numbers
 from ftl_lightning.services.validation import LARGEST_FACTOR, check_factor, check_range, check_type, from_mapping
 
 KIND = "concept"
-SKILL, KNOWN = "skill, ", "best training concept"
-"""Prefix of the skill of forms and references in :attr:`Choice.numbers`, and the reference of a training concept."""
+SKILL, NEARER, KNOWN = "skill, ", "nearer, ", "best training concept"
+"""Prefixes of :attr:`Choice.skills` and :attr:`Choice.nearer` in its numbers, and the reference of a training concept."""
 VERSION = 5
 """Version of the file format."""
 MODES = ("mode_embeddings", "mode_weights")
@@ -123,17 +123,27 @@ class Choice:
     @property
     def skills(self) -> Mapping[str, float]:
         """Skill of forms and references on left-out demonstrations, see :class:`~ftl_lightning.igm.forms.skill.LeftOut`."""
-        return {name.removeprefix(SKILL): value for name, value in self.numbers.items() if name.startswith(SKILL)}
+        return self._named(SKILL)
+
+    @property
+    def nearer(self) -> Mapping[str, float]:
+        """Share of samples of forms and references that are nearer to the demonstrations than to the best training concept."""
+        return self._named(NEARER)
+
+    def _named(self, prefix: str) -> dict[str, float]:
+        return {name.removeprefix(prefix): value for name, value in self.numbers.items() if name.startswith(prefix)}
 
     @property
     def words(self) -> str:
-        """Skill of the form beside the references that need no learning; empty if it was not measured."""
+        """Skill of the form beside references that need no learning, and share of nearer samples; empty if it was not measured."""
         skills = self.skills
         if self.form not in skills:
             return ""
         others = sorted(((skills[name], name) for name in (*NAMES, KNOWN) if name in skills and name != self.form), reverse=True)
         beside = ", ".join(f"{name} {value:.2f}" for value, name in others)
-        return f"{self.form} has skill {skills[self.form]:.2f} on left-out demonstrations (without learning: {beside})"
+        said = f"{self.form} has skill {skills[self.form]:.2f} on left-out demonstrations (without learning: {beside})"
+        share = self.nearer.get(self.form)
+        return said if share is None else f"{said}, {share:.2f} of its samples are nearer to the demonstrations than to the {KNOWN}"
 
 
 @dataclass(frozen=True)

@@ -172,6 +172,9 @@ def test_the_form_of_ones_own_data_is_chosen_by_skill_beside_references(model: F
     assert learned.concept.share == 1
     assert "no learned form adds to varied demonstrations" in choice.because
     assert all(0 < skill < 2 for skill in choice.skills.values())
+    assert set(choice.nearer) == set(choice.skills)
+    assert all(0 <= share <= 1 for share in choice.nearer.values())
+    assert f"{choice.nearer[choice.form]:.2f} of its samples are nearer to the demonstrations than to the {KNOWN}" in choice.words
     assert f"{choice.form} has skill {choice.skills[choice.form]:.2f} on left-out demonstrations (without learning: " in str(
         learned.quality
     )
@@ -252,6 +255,20 @@ def test_the_share_of_a_mixture_is_that_with_the_best_score(model: FewShot) -> N
     both = [torch.cat(pair, dim=1) for pair in zip(low.values, high.values, strict=True)]
     direct = left._mean([apart(samples, real) for samples, real in zip(both, truth, strict=True)])
     assert float(scores[5]) < float(direct.mean())
+
+
+def test_samples_are_nearer_to_demonstrations_or_to_a_training_concept(model: FewShot) -> None:
+    left = LeftOut(model.model, walks("between", 4), model.model.examples)
+    values = left.features(left.truth)
+    ones = torch.ones(4)
+
+    def at(offsets: Tensor) -> Drawn:
+        return Drawn([each[:, None] + offsets[:, None] for each in values], ones, ones)
+
+    training = at(torch.full((16,), 10.0))
+    assert left.nearer(at(torch.zeros(16)), training) == 1
+    assert left.nearer(training, training) == 0
+    assert left.nearer(at(torch.cat((torch.zeros(4), torch.full((12,), 9.0)))), training) == 0.25
 
 
 def test_a_mixture_has_its_share_of_samples_without_the_model(model: FewShot) -> None:

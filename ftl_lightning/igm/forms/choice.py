@@ -10,7 +10,7 @@ from torch import Tensor
 from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.data.references import VARIED, WARPED, Reference, Setting
 from ftl_lightning.igm.composition import Composition
-from ftl_lightning.igm.concept import KNOWN, SKILL, Choice, Concept
+from ftl_lightning.igm.concept import KNOWN, NEARER, SKILL, Choice, Concept
 from ftl_lightning.igm.forms.combination import Combination
 from ftl_lightning.igm.forms.leave_one_out import learned_from, quickly, relative_losses
 from ftl_lightning.igm.forms.modes import Modes, even_stretch
@@ -252,6 +252,12 @@ def by_skill(
     called = form if not share else varied if share == 1 else f"{form} and {varied}"
     skills[called] = left.skill(mixture[number].mean())
     numbers = {f"{SKILL}{name}": round(value, 4) for name, value in skills.items()}
+    if (known := references.get(KNOWN)) is not None:
+        every = drawn | references | {VARIED: made[VARIED, usual]}
+        nearer = {name: left.nearer(value, known) for name, value in every.items()}
+        mixed = (1 - share, both[variation]), (share, made[maker, variation])
+        nearer[called] = sum(part * left.nearer(value, known) for part, value in mixed)
+        numbers |= {f"{NEARER}{name}": round(value, 4) for name, value in nearer.items()}
     because = f"{_because(skills[called], skills[form], form, varied, share)}; {beside}"
     composing = None if COMBINED not in whole or form == COMBINED else (whole[COMBINED].embeddings, whole[COMBINED].weights)
     keep = composing is not None and float(drawn[COMBINED].score.mean()) <= float(drawn[ONE].score.mean())

@@ -69,6 +69,7 @@ class LeftOut:
         fresh: energy score of fresh demonstrations ``(feature,)``, from the distances among the demonstrations; where places are
             observed, from those among the demonstrations moved to the places of each.
         setting: what the training concepts say about behaviour, for references.
+        known: features ``(demo, n)`` of the demonstrations, of each kind.
     """
 
     def __init__(self, model: Invertible, demonstrations: Demonstrations, training: Demonstrations) -> None:
@@ -80,6 +81,7 @@ class LeftOut:
         real = encoded(self.model, first_windows(training, model.horizon), training.initial_states)
         self.features = PathFeatures(real, self._within(training))
         known = encoded(self.model, first_windows(demonstrations, model.horizon), demonstrations.initial_states)
+        self.known = self.features(known)
         self.truth = known[self.rows]
         some = torch.randperm(len(real), generator=generator("cpu", 0, 8))[: 4 * SAMPLES]
         self.unit = self.features.scores(real[some].expand(len(self.rows), -1, -1, -1), self.truth).mean(dim=0).clamp(min=1e-9)
@@ -130,9 +132,19 @@ class LeftOut:
         return Drawn(values, self._mean(far), self._mean([among(samples) for samples in values]))
 
     def _mean(self, distances: Sequence[Tensor]) -> Tensor:
-        """Mean over features of distances ``(fold,)``, each relative to the score of fresh demonstrations."""
+        """Mean over features of distances ``(fold, ...)``, each relative to the score of fresh demonstrations."""
         scaled = [distance / unit for distance, unit in zip(distances, self.features.units, strict=True)]
-        return (torch.stack(scaled, dim=1) / self.unit / (self.fresh + LEAST)).mean(dim=1)
+        return (torch.stack(scaled, dim=-1) / self.unit / (self.fresh + LEAST)).mean(dim=-1)
+
+    def nearer(self, drawn: Drawn, training: Drawn) -> float:
+        """Share of samples that are nearer to a demonstration than to each of as many samples of a ``training`` concept."""
+        known = [values.expand(len(self.rows), -1, -1) for values in self.known]
+        count = min(known[0].shape[1], SAMPLES)
+        own, other = (
+            self._mean([torch.cdist(some, each[:, :count]) for some, each in zip(drawn.values, others, strict=True)]).amin(dim=2)
+            for others in (known, training.values)
+        )
+        return float((own < other).float().mean())
 
     def mixed(self, learned: Drawn, made: Drawn) -> Tensor:
         """Scores ``(share, fold)`` of mixtures in which the :data:`SHARES` of the samples are of ``made``."""
