@@ -440,11 +440,12 @@ def held(values: Tensor, lengths: Tensor, continues: float = CONTINUES) -> Tenso
 def concatenate(parts: Sequence[Demonstrations]) -> Demonstrations:
     """Concatenate demonstrations of a domain, padded to the longest, with the provenance of the first part.
 
-    A feature is observed at every time, and there are scenes, only if this holds for all parts.
+    A feature is observed at every time, and there are scenes and actions, only if this holds for all parts.
     """
     first, longest = parts[0], max(part.states.shape[1] for part in parts)
     per_step = tuple(name for name in first.per_step if all(name in part.per_step for part in parts))
     scenes = [part.scenes for part in parts if part.scenes is not None]
+    actions = [_padded(part.actions, longest) for part in parts if part.actions is not None]
 
     def observed(part: Demonstrations, name: str) -> Tensor:
         return _padded(part.observed[name], longest) if name in per_step else part.initial_states.observed[name]
@@ -457,6 +458,8 @@ def concatenate(parts: Sequence[Demonstrations]) -> Demonstrations:
         observed={name: torch.cat([observed(part, name) for part in parts]) for name in first.observed},
         per_step=per_step,
         scenes=torch.cat(scenes) if len(scenes) == len(parts) else None,
+        actions=torch.cat(actions) if len(actions) == len(parts) else None,
+        action_names=first.action_names if len(actions) == len(parts) else (),
     )
 
 

@@ -23,8 +23,8 @@ RIDGE, WINDOW = 0.01, 0.05
 """Ridge penalty of the shares with which paths follow places, relative to the places' mean square; half width of the window of
 times that share an estimate, as a share of the horizon.
 """
-ALIKE = 2.0
-"""Maximum ratio of the standard deviations of two places of a kind, and distance of their means in standard deviations."""
+ALIKE = 1.5
+"""Maximum ratio of the standard deviations of two places of a kind; their means differ by at most a standard deviation."""
 MOST_ALIKE = 4
 """Maximum number of places of a kind whose exchange is a prior."""
 PRIOR = 0.01
@@ -84,6 +84,9 @@ def starts(demonstrations: Demonstrations) -> Places:
 def places(demonstrations: Demonstrations, horizon: int) -> Places:
     """Features that paths of some concept follow: at some time the path varies with the feature, and hardly beside it.
 
+    A vector may hold several places, such as goals. A place that no training concept follows is one if it is alike the followed
+    places of its vector, or two others: a new concept may follow it.
+
     Args:
         demonstrations: demonstrations of training concepts, several of each.
         horizon: number of states that are compared.
@@ -115,16 +118,18 @@ def places(demonstrations: Demonstrations, horizon: int) -> Places:
         if name in found:
             continue
         for each in _parts(name, values, width):
-            followed = {part: columns for part, value in each.items() for share, columns in [best(value)] if share <= FOLLOWED}
-            if followed:
-                found |= followed
+            some = {part: columns for part, value in each.items() for share, columns in [best(value)] if share <= FOLLOWED}
+            if some:
+                found |= some
                 parts |= each
                 break
         else:
             parts |= {name: values} if values.shape[1] <= width else {}
+    followed = set(found) - begin
     for name, values in parts.items():
-        kin = [other for other in found if other not in begin and _alike(values, parts[other])] if name not in found else []
-        if kin:
+        whole = feature_of(name, vectors)
+        kin = [other for other in followed if _alike(values, parts[other])] if name not in found else []
+        if len(kin) >= 2 or any(whole == feature_of(other, vectors) for other in kin):
             found[name] = found[kin[0]]
     return found
 
@@ -143,7 +148,7 @@ def _alike(values: Tensor, others: Tensor) -> bool:
     if values.shape != others.shape:
         return False
     first, second = values.std(dim=0).clamp(min=1e-9), others.std(dim=0).clamp(min=1e-9)
-    near = (values.mean(dim=0) - others.mean(dim=0)).abs() <= ALIKE * torch.minimum(first, second)
+    near = (values.mean(dim=0) - others.mean(dim=0)).abs() <= torch.minimum(first, second)
     return bool((near & (first <= ALIKE * second) & (second <= ALIKE * first)).all())
 
 

@@ -252,8 +252,8 @@ def domain_from_file(
     Args:
         path: the file, the folder of a LeRobot data set, or the name of an installed Minari data set.
         horizon: states in a plan; ``None`` for the length of the longest demonstration, or :data:`WINDOW` if it is longer than
-            :data:`LONGEST_PLAN`. If plans are whole demonstrations and follow observed places, only features at the first time are
-            used.
+            :data:`LONGEST_PLAN`. Plans of data with actions that are whole demonstrations and follow observed places use features
+            at the first time alone.
         metrics: see :func:`own_domain`.
         share: share of each concept's demonstrations to hold out at random, at least a single demonstration.
         kinds: kinds of columns by name, see :func:`~ftl_lightning.data.kinds.declared`.
@@ -285,7 +285,7 @@ def domain_from_file(
         note(f"data.horizon: actions follow the present state, so plans are windows of {horizon}; {whole}")
     if acts and horizon is not None and horizon < longest:
         demonstrations = with_present(demonstrations)
-    if demonstrations.per_step and longest <= (horizon or usual) and followed:
+    if acts and demonstrations.per_step and longest <= (horizon or usual) and followed:
         demonstrations = demonstrations.at_start
     source = FileSource(demonstrations, held_out)
     return own_domain(source.split("validation", 0, 0), tuple(rows_of), horizon or usual, metrics, source)

@@ -118,7 +118,7 @@ def rollout(
 ) -> Episodes:
     """Run episodes in lockstep, in up to :data:`SIDE_BY_SIDE` environments; see :meth:`FewShot.rollout`."""
     made = [_made(environment)]
-    several = not hasattr(environment, "step")
+    several = isinstance(environment, type) or not hasattr(environment, "step")
     made += [_made(environment) for _ in range(min(SIDE_BY_SIDE, episodes) - 1 if several else 0)]
     with ExitStack() as stack:
         for each in made if several else ():
@@ -129,6 +129,7 @@ def rollout(
             for first in range(0, episodes, len(made)):
                 rows = range(first, min(first + len(made), episodes))
                 record.run(rows, limit, advance)
+        require(record.begun is not None, "environment", "episodes that begin", "none; the warnings above say why")
         first_time, times = _latency(policy, record.begun, seed)
     return Episodes(
         _successes(record.infos, record.failed, success),
@@ -150,7 +151,7 @@ def _made(environment: Any) -> "gymnasium.Env[Any, Any]":
             return gymnasium.make(environment, render_mode="rgb_array")
         except (gymnasium.error.Error, ImportError, TypeError) as error:
             raise UserError(f"environment: expected the name of a Gymnasium environment, found {short(str(error), 150)}") from error
-    made = environment if hasattr(environment, "step") else environment()
+    made = environment if hasattr(environment, "step") and not isinstance(environment, type) else environment()
     require(hasattr(made, "step") and hasattr(made, "reset"), "environment", "a Gymnasium environment", shown(made))
     return made
 
@@ -213,8 +214,6 @@ def _successes(
 
 def _latency(policy: Policy, observation: Any, seed: int) -> tuple[float, tuple[float, ...]]:
     """Milliseconds of the first action and of :data:`TIMED` later chunks of a single episode that stays where it begins."""
-    if observation is None:
-        return math.nan, (math.nan,)
     times: list[float] = []
     while len(times) <= TIMED:
         follow = policy.following(1, seed)

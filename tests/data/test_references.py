@@ -24,7 +24,7 @@ def reaches(kind: str, count: int, seed: int) -> Demonstrations:
     bow = 0.1 * rng.normal(size=(count, 1, 1)) * np.sin(np.pi * np.linspace(0, 1, TIME))[None, :, None]
     path = start[:, None] * (1 - share) + end[:, None] * share + bow
     clock = np.linspace(0, 1, TIME)[None, :, None].repeat(count, axis=0)
-    observed = {"start": start, "thing": thing, "goal": goal, "colour": rng.uniform(-1, 1, (count, 2))}
+    observed = {"start": start, "thing": thing, "goal": goal, "colour": rng.uniform(0, 1, (count, 2))}
     features = {name: torch.tensor(values, dtype=torch.float32) for name, values in observed.items()}
     return Demonstrations.of(list(np.concatenate((path, clock), axis=2)), kind, observed=features)
 

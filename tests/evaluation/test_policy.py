@@ -1,0 +1,277 @@
+"""Policies of a user's data: observations, actions, and episodes in an environment of one's own."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.spaces import Box, Dict
+
+from ftl_lightning import FewShot
+from ftl_lightning.data.demonstrations import Demonstrations
+from ftl_lightning.services.errors import UserError
+from tests.conftest import CONF, Once, succeed
+
+STEPS, NEAR = 30, 0.1
+
+
+class Goals(gymnasium.Env[Any, Any]):
+    """A point, moved by its action, that has to reach one of three goals, or the middle of two."""
+
+    observation_space = Dict(state=Box(-2, 2, (2,), np.float32), goals=Box(-2, 2, (6,), np.float32))
+    action_space = Box(-0.2, 0.2, (2,), np.float32)
+
+    def __init__(self, task: int | str = 0, render_mode: str | None = None) -> None:
+        self.task, self.render_mode = task, render_mode
+
+    def _seen(self) -> dict[str, Any]:
+        return {"state": self.x.astype(np.float32), "goals": self.goals.reshape(-1).astype(np.float32)}
+
+    @property
+    def target(self) -> Any:
+        return (self.goals[0] + self.goals[1]) / 2 if self.task == "middle" else self.goals[int(self.task)]
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.goals, self.x, self.time = self.np_random.uniform(-1, 1, (3, 2)), self.np_random.uniform(-1, 1, 2), 0
+        return self._seen(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.x, self.time = self.x + np.clip(action, -0.2, 0.2), self.time + 1
+        right = bool(np.linalg.norm(self.x - self.target) < NEAR)
+        return self._seen(), float(right), False, self.time == STEPS, {"is_success": right, "distance": 0.0}
+
+    def render(self) -> Any:
+        picture = np.full((32, 32, 3), 255, np.uint8)
+        row, column = ((self.x.clip(-1.4, 1.4) + 1.5) * 10).astype(int)
+        picture[row, column] = 0
+        return picture
+
+
+def shown(task: int | str, count: int, seed: int, flat: bool = False) -> Demonstrations:
+    """Demonstrations of an expert that goes straight to its target."""
+    rng, paths, done, seen = np.random.default_rng(seed), [], [], []
+    env = Goals(task)
+    for episode in range(count):
+        observation, _ = env.reset(seed=1000 * seed + episode)
+        path, acts = [observation["state"]], []
+        for _ in range(STEPS):
+            away = 0.25 * (env.target - env.x)
+            acts.append((away * min(1, 0.15 / np.linalg.norm(away)) + rng.normal(0, 0.003, 2)).astype(np.float32))
+            path.append(env.step(acts[-1])[0]["state"])
+        goals = np.repeat(observation["goals"][None], len(path), axis=0)
+        paths.append(np.concatenate((path, goals), axis=1) if flat else np.array(path))
+        done.append(np.array(acts))
+        seen.append(goals)
+    features = {} if flat else {"observed": {"goals": torch.tensor(np.array(seen))}, "per_step": ("goals",)}
+    return Demonstrations.of(paths, f"go to {task}", actions=done, **features)
+
+
+def trained(once: Once, name: str, steps: int, flat: bool = False) -> FewShot:
+    def fit(folder: Path) -> None:
+        from ftl_lightning.data.demonstrations import concatenate
+
+        concatenate([shown(task, 40, 1 + task, flat) for task in (0, 1)]).save("goals.npz")
+        options = ["--data.encoder=hashing", "--data.metrics={}", "--trainer.logger.save_dir=.", f"--trainer.max_steps={steps}"]
+        succeed("fit", f"--config={CONF / 'own.yaml'}", "--data.demonstrations=goals.npz", *options)
+
+    return FewShot.from_pretrained(once(name, fit) / "own" / "fit" / "pretrained")
+
+
+@pytest.fixture(scope="module")
+def quick(once: Once) -> FewShot:
+    return trained(once, "goals_quick", 20)
+
+
+def test_a_policy_acts_for_an_environment_or_a_batch(quick: FewShot) -> None:
+    env = Goals()
+    policy = quick.policy(quick["go to 0"], execute=8)
+    assert policy.plan is None
+    first = [env.reset(seed=seed)[0] for seed in (0, 1)]
+    policy.reset(seed=3)
+    action = policy.act(first[0])
+    assert action.shape == (2,)
+    plan = policy.plan
+    assert plan is not None
+    assert plan.shape == (STEPS + 1, 4)
+    assert plan[0, :2].tolist() == pytest.approx(first[0]["state"].tolist(), abs=1e-5)
+    policy.reset(seed=3)
+    assert (policy.act(first[0]) == action).all()
+    policy.reset(seed=4)
+    assert (policy.act(first[0]) != action).any()
+    policy.reset(seed=3)
+    both = policy.act({name: np.stack([seen[name] for seen in first]) for name in first[0]})
+    assert both.shape == (2, 2)
+    assert both[0] == pytest.approx(action, abs=1e-4)
+    with pytest.raises(UserError, match="act: expected a batch of 2, found 1"):
+        policy.act(first[0])
+
+
+@pytest.mark.parametrize("name", ["observation", "agent_pos", "position"])
+def test_the_present_state_has_one_of_several_names(quick: FewShot, name: str) -> None:
+    seen = Goals().reset(seed=0)[0]
+    policy = quick.policy(quick["go to 0"])
+    expected = policy.act(seen)
+    policy.reset()
+    assert (policy.act({name: seen["state"], "goals": seen["goals"]}) == expected).all()
+    policy.reset()
+    assert (policy.act(np.concatenate((seen["state"], seen["goals"]))) == expected).all()
+    observed = quick.policy(quick["go to 0"], observe=lambda pair: {"state": pair[0], "goals": pair[1]})
+    assert (observed.act((seen["state"], seen["goals"])) == expected).all()
+
+
+@pytest.mark.parametrize(
+    ("observation", "expected"),
+    [
+        ({"goals": np.zeros(6)}, r"the present state \(key 'state'\) of shape \(2,\)"),
+        ({"state": np.zeros(2)}, r"'goals' of shape \(6,\)"),
+        (np.zeros(7), r"a vector of 6 \(goals\) \+ 2 \(state\) numbers|a vector of 2 \(state\) \+ 6 \(goals\) numbers"),
+        ({"state": np.array([np.nan, 0]), "goals": np.zeros(6)}, "expected finite numbers"),
+        ({"state": np.zeros(2), "goals": np.zeros((2, 6))}, "a batch of every feature, or of none"),
+        ("left", "expected numbers"),
+    ],
+)
+def test_other_observations_are_refused(quick: FewShot, observation: Any, expected: str) -> None:
+    with pytest.raises(UserError, match=expected):
+        quick.policy(quick["go to 0"]).act(observation)
+
+
+def test_a_controller_of_the_user_gets_present_and_next_planned_state(quick: FewShot) -> None:
+    seen, calls = Goals().reset(seed=0)[0], []
+
+    def control(present: Any, following: Any) -> Any:
+        calls.append((present, following))
+        return following - present
+
+    policy = quick.policy(quick["go to 0"], act=control)
+    action = policy.act(seen)
+    assert "given controller" in str(policy)
+    assert policy.plan is not None
+    assert action == pytest.approx((policy.plan[1, :2] - policy.plan[0, :2]).numpy(), abs=1e-5)
+    assert calls[0][0].shape == (1, 2)
+
+
+def test_plans_are_made_every_so_many_steps(quick: FewShot) -> None:
+    env, made = Goals(), []
+    policy = quick.policy(quick["go to 0"], execute=5)
+    observation, _ = env.reset(seed=0)
+    for _ in range(12):
+        observation, *_ = env.step(policy.act(observation))
+        made.append(policy.plan)
+    changes = [step for step in range(1, 12) if not torch.equal(made[step], made[step - 1])]
+    assert changes == [5, 10]
+
+
+@pytest.mark.parametrize(
+    ("success", "expected"),
+    [("info.is_success", None), (None, None), (lambda info: True, 1.0), ("info.distance", 0.0)],
+)
+def test_success_is_read_where_it_is_named(quick: FewShot, success: Any, expected: float | None) -> None:
+    episodes = quick.rollout(quick.policy(quick["go to 0"]), Goals, episodes=3, success=success)
+    assert len(episodes) == 3
+    assert episodes.lengths == (STEPS,) * 3
+    assert episodes.success == (np.mean([info["is_success"] for info in episodes.infos]) if expected is None else expected)
+    low, high = episodes.interval
+    assert 0 <= low <= episodes.success <= high <= 1
+    assert episodes.latency[0] > 0
+
+
+def test_rollouts_that_cannot_be_are_refused(quick: FewShot) -> None:
+    policy = quick.policy(quick["go to 0"])
+    with pytest.raises(UserError, match=r"success: expected 'info.KEY' with one of is_success, distance, found 'info.won'"):
+        quick.rollout(policy, Goals, episodes=1, success="info.won")
+    with pytest.raises(UserError, match="environment: expected the name of a Gymnasium environment"):
+        quick.rollout(policy, "NoSuchEnvironment-v0")
+    with pytest.raises(UserError, match="policy: expected a policy"):
+        quick.rollout(quick["go to 0"], Goals)  # type: ignore[arg-type]
+
+
+def test_the_first_episode_is_filmed_if_the_environment_renders(quick: FewShot, tmp_path: Path) -> None:
+    policy = quick.policy(quick["go to 0"])
+    episodes = quick.rollout(policy, lambda: Goals(render_mode="rgb_array"), episodes=2)
+    assert len(episodes.frames) == STEPS + 1
+    episodes.save(tmp_path / "film.gif")
+    assert (tmp_path / "film.gif").stat().st_size > 100
+    with pytest.raises(UserError, match="render_mode"):
+        quick.rollout(policy, Goals, episodes=1).save(tmp_path / "none.gif")
+
+
+def test_an_environment_that_breaks_loses_its_episode(quick: FewShot) -> None:
+    class Breaking(Goals):
+        def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+            if self.time == 3 and self.x[0] > 0:
+                raise RuntimeError("broken")
+            return super().step(action)
+
+    episodes = quick.rollout(quick.policy(quick["go to 0"]), Breaking, episodes=8, success=lambda info: True)
+    assert 0 < sum(episodes.failed) < 8
+    assert episodes.successes == tuple(not lost for lost in episodes.failed)
+
+
+def test_policies_of_domains_with_an_environment_use_its_planner() -> None:
+    model = FewShot.from_pretrained("driving")
+    policy = model.policy(model[model.training_concepts[0]], execute=1)
+    assert "the domain's planner" in str(policy)
+    starts = model.starts(model.training_concepts[0], 1)
+    action = policy.act({name: values[0].numpy() for name, values in starts.observed.items()})
+    assert np.isfinite(action).all()
+    with pytest.raises(UserError, match="act: expected none"):
+        model.policy(model[model.training_concepts[0]], act=lambda present, following: present)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("flat", [False, True])
+def test_a_new_goal_is_reached_from_five_demonstrations(once: Once, flat: bool) -> None:
+    model = trained(once, f"goals_{flat}", 600, flat)
+
+    class Flat(gymnasium.ObservationWrapper):  # type: ignore[type-arg]
+        observation_space = Box(-2, 2, (8,), np.float32)
+
+        def observation(self, observation: Any) -> Any:
+            return np.concatenate((observation["state"], observation["goals"]))
+
+    for task in (2, "middle"):
+        make: Callable[[], Any] = (lambda task=task: Flat(Goals(task))) if flat else (lambda task=task: Goals(task))  # type: ignore[misc]
+        concept = model.learn(shown(task, 5, 50, flat), name="new")
+        episodes = model.rollout(model.policy(concept), make, episodes=30)
+        assert episodes.success >= 0.9, (task, episodes)
+
+
+@pytest.mark.slow
+def test_pendulums_are_swung_by_windows_from_the_present_state(once: Once) -> None:
+    def swings(amplitude: float, count: int, seed: int) -> Demonstrations:
+        env, paths, done = gymnasium.make("Pendulum-v1", max_episode_steps=100), [], []
+        for episode in range(count):
+            observation, _ = env.reset(seed=1000 * seed + episode)
+            path, acts = [observation], []
+            for _ in range(100):
+                energy = observation[2] ** 2 / 6 + 5 * (1 + observation[0])
+                push = 3 * (5 * (1 - np.cos(amplitude)) - energy) * np.sign(observation[2] if abs(observation[2]) > 0.05 else 1)
+                acts.append(np.clip([push], -2, 2).astype(np.float32))
+                observation, *_ = env.step(acts[-1])
+                path.append(observation)
+            paths.append(np.array(path))
+            done.append(np.array(acts))
+        return Demonstrations.of(paths, f"swing by {amplitude}", actions=done)
+
+    def fit(folder: Path) -> None:
+        from ftl_lightning.data.demonstrations import concatenate
+
+        concatenate([swings(amplitude, 40, number) for number, amplitude in enumerate((0.6, 1.0, 1.8))]).save("swings.npz")
+        options = ["--data.encoder=hashing", "--data.metrics={}", "--trainer.logger.save_dir=.", "--trainer.max_steps=1000"]
+        succeed("fit", f"--config={CONF / 'own.yaml'}", "--data.demonstrations=swings.npz", *options)
+
+    class Swung(gymnasium.Wrapper):  # type: ignore[type-arg]
+        def step(self, action: Any) -> Any:
+            observation, *rest, _ = super().step(action)
+            self.angles = [*getattr(self, "angles", []), abs(np.arctan2(-observation[1], -observation[0]))][-50:]
+            return observation, *rest, {"is_success": abs(max(self.angles) - 1.4) < 0.2}
+
+    model = FewShot.from_pretrained(once("swings", fit) / "own" / "fit" / "pretrained")
+    assert model.model.horizon == 32  # actions follow the present state
+    concept = model.learn(swings(1.4, 5, 60), name="swing by 1.4")
+    episodes = model.rollout(model.policy(concept), lambda: Swung(gymnasium.make("Pendulum-v1", max_episode_steps=100)), 30)
+    assert episodes.success >= 0.8, episodes
