@@ -265,7 +265,7 @@ class Demonstrations(Shown):
         return replace(self, observed=self.initial_states.observed, per_step=())
 
     def columns(self, chosen: Sequence[int]) -> Self:
-        """Select columns of the states by their numbers from 0, in this order."""
+        """Select columns of the states by their numbers from 0 (``chosen``), in this order."""
         return replace(
             self,
             states=self.states[..., list(chosen)],

@@ -255,6 +255,8 @@ class Policy(Shown):
         require(len(self._following.followed) in (0, count), "act", f"a batch of {len(self._following.followed)}", count)
         with torch.inference_mode():
             actions = self._following(observed, list(range(count)), self._step).numpy().astype(np.float32)
+        for plans in self._following.followed.values():
+            del plans[:-1]  # an episode may be long
         self._step += 1
         return actions if batch else actions[0]
 
