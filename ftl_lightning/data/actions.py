@@ -110,17 +110,26 @@ class Regression:
         return (features @ self.readout).clamp(self.low, self.high).float()
 
 
-def inverse_model(states: Tensor, actions: Tensor, lengths: Tensor) -> Regression:
-    """Regression of actions on the present state and the step to the next ``(sample, 2 * state)``.
+def inverse_model(states: Tensor, actions: Tensor, lengths: Tensor, ahead: int = 1) -> Regression:
+    """Regression of actions on the present state and the difference to the state some steps ahead ``(sample, 2 * state)``.
 
     Args:
         states, actions: ``(demo, time, state)`` and ``(demo, time, action)``.
         lengths: valid times of each demonstration ``(demo,)``.
+        ahead: number of steps; at the end of a demonstration its last state is ahead.
     """
     row, time = _times(lengths - 1)
-    first = states[row, time].double()
-    inputs = torch.cat((first, states[row, time + 1].double() - first), dim=1)
+    first, later = states[row, time].double(), torch.minimum(time + ahead, lengths[row] - 1)
+    inputs = torch.cat((first, states[row, later].double() - first), dim=1)
     return Regression.fit(inputs, actions[row, time], row, HIDDEN, LARGEST_FIT)
+
+
+def forward_model(states: Tensor, actions: Tensor, lengths: Tensor) -> Regression:
+    """Regression of the step to the next state on the present state and action; arguments as of :func:`inverse_model`."""
+    row, time = _times(lengths - 1)
+    first = states[row, time].double()
+    inputs = torch.cat((first, actions[row, time].double()), dim=1)
+    return Regression.fit(inputs, states[row, time + 1].double() - first, row, HIDDEN, LARGEST_FIT)
 
 
 def follows_present(states: Tensor, actions: Tensor, lengths: Tensor, concepts: Sequence[str], observed: Tensor) -> bool:

@@ -9,6 +9,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
+from ftl_lightning.data.actions import action_columns
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import Observed
 
@@ -19,6 +20,8 @@ EQUAL = 1e-4
 """Maximum difference of the initial state from a feature that equals it, relative to the columns' range."""
 FOLLOWED = 0.1
 """Maximum variance of the distance to a place, at the time at which a concept follows it most, relative to the place's variance."""
+STRICTLY = 0.01
+"""The same for single numbers of a vector, of which some are alike a column by chance."""
 RIDGE, WINDOW = 0.01, 0.05
 """Ridge penalty of the shares with which paths follow places, relative to the places' mean square; half width of the window of
 times that share an estimate, as a share of the horizon.
@@ -67,9 +70,14 @@ def _windows(size: int, units: tuple[str, ...], width: int) -> list[tuple[int, .
     return [group for group in groups if len({units[column] for column in group} if units else {""}) == 1]
 
 
+def _width(demonstrations: Demonstrations) -> int:
+    """Number of columns of a state without actions, which are the last."""
+    return demonstrations.states.shape[2] - len(action_columns(demonstrations.state_names))
+
+
 def starts(demonstrations: Demonstrations) -> Places:
     """Features that equal columns of the initial state in every demonstration."""
-    first, found = demonstrations.states[:, 0], {}
+    first, found = demonstrations.states[:, 0, : _width(demonstrations)], {}
     spread = first.amax(dim=0) - first.amin(dim=0)
     for name, values in vectors_of(demonstrations).items():
         for columns in _windows(values.shape[1], demonstrations.state_units, first.shape[1]):
@@ -94,7 +102,7 @@ def places(demonstrations: Demonstrations, horizon: int) -> Places:
     paths, texts = first_windows(demonstrations, horizon), demonstrations.concepts
     rows = [[row for row, text in enumerate(texts) if text == name] for name in dict.fromkeys(texts)]
     found: dict[str, tuple[int, ...]] = dict(starts(demonstrations))
-    begin, width = set(found), paths.shape[2]
+    begin, width = set(found), _width(demonstrations)
     vectors = vectors_of(demonstrations)
 
     def best(values: Tensor) -> tuple[float, tuple[int, ...]]:
@@ -118,7 +126,8 @@ def places(demonstrations: Demonstrations, horizon: int) -> Places:
         if name in found:
             continue
         for each in _parts(name, values, width):
-            some = {part: columns for part, value in each.items() for share, columns in [best(value)] if share <= FOLLOWED}
+            most = FOLLOWED if all(value.shape[1] > 1 for value in each.values()) or name in each else STRICTLY
+            some = {part: columns for part, value in each.items() for share, columns in [best(value)] if share <= most}
             if some:
                 found |= some
                 parts |= each
@@ -137,7 +146,7 @@ def places(demonstrations: Demonstrations, horizon: int) -> Places:
 def _parts(name: str, values: Tensor, width: int) -> Iterator[dict[str, Tensor]]:
     """Ways to divide a vector ``(demo, size)`` into places of at most ``width`` numbers, the largest first."""
     size = values.shape[1]
-    for each in range(min(size, width), 1 if size > width else size - 1, -1):
+    for each in range(min(size, width), 0, -1):
         if size % each == 0:
             starts = range(0, size, each)
             yield {name if each == size else f"{name}[{first}:{first + each}]": values[:, first : first + each] for first in starts}

@@ -192,12 +192,12 @@ def context_of(demonstrations: Demonstrations) -> str:
 
 
 def with_context(demonstrations: Demonstrations, context: str) -> Demonstrations:
-    """Demonstrations whose columns of a context, see :func:`context_of`, are an observed feature that is known at the start."""
+    """Demonstrations whose columns of a context, see :func:`context_of`, are an observed feature."""
     names = context.removeprefix(CONTEXT).split(",")
     columns = [demonstrations.state_names.index(name) for name in names]
     rest = [column for column in range(demonstrations.states.shape[2]) if column not in columns]
-    observed = {**demonstrations.observed, context: demonstrations.states[:, 0, columns].float()}
-    return replace(demonstrations.columns(rest), observed=observed)
+    observed = {**demonstrations.observed, context: demonstrations.states[..., columns].float()}
+    return replace(demonstrations.columns(rest), observed=observed, per_step=(*demonstrations.per_step, context))
 
 
 def with_present(demonstrations: Demonstrations) -> Demonstrations:
@@ -252,8 +252,7 @@ def domain_from_file(
     Args:
         path: the file, the folder of a LeRobot data set, or the name of an installed Minari data set.
         horizon: states in a plan; ``None`` for the length of the longest demonstration, or :data:`WINDOW` if it is longer than
-            :data:`LONGEST_PLAN`. Plans of data with actions that are whole demonstrations and follow observed places use features
-            at the first time alone.
+            :data:`LONGEST_PLAN`. Plans of data with actions that are whole demonstrations use features at the first time alone.
         metrics: see :func:`own_domain`.
         share: share of each concept's demonstrations to hold out at random, at least a single demonstration.
         kinds: kinds of columns by name, see :func:`~ftl_lightning.data.kinds.declared`.
@@ -276,7 +275,7 @@ def domain_from_file(
     usual = longest if longest <= LONGEST_PLAN else WINDOW
     acts = list(action_columns(demonstrations.state_names))
     if acts and (context := context_of(demonstrations)):
-        note(f"{short(context, 80)}: columns that are constant in each demonstration are observed where plans start")
+        note(f"{short(context, 80)}: columns that are constant in each demonstration are observed")
         demonstrations = with_context(demonstrations, context)
         acts = list(action_columns(demonstrations.state_names))
     followed = places(demonstrations, longest)
@@ -285,8 +284,9 @@ def domain_from_file(
         note(f"data.horizon: actions follow the present state, so plans are windows of {horizon}; {whole}")
     if acts and horizon is not None and horizon < longest:
         demonstrations = with_present(demonstrations)
-    if acts and demonstrations.per_step and longest <= (horizon or usual) and followed:
+    if acts and longest <= (horizon or usual):
         demonstrations = demonstrations.at_start
+        note(f"{path}: plans are whole demonstrations, which follow the places {short(', '.join(followed), 80) or 'none'}")
     source = FileSource(demonstrations, held_out)
     return own_domain(source.split("validation", 0, 0), tuple(rows_of), horizon or usual, metrics, source)
 

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from ftl_lightning.data.actions import CONTEXT, PRESENT, action_columns, inverse_model
+from ftl_lightning.data.actions import CONTEXT, PRESENT, Regression, action_columns, forward_model, inverse_model
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import PINNED, Observed, moved
 from ftl_lightning.data.pinned import Pinned
@@ -28,8 +28,8 @@ STATE = "(state)"  # no user's feature has this name
 """Key of the present states among observed features."""
 NAMES = ("state", "states", "observation", "observation.state", "agent_pos")
 """Keys of the present state in an observation that is a dictionary."""
-EXPLAINED = 0.1
-"""Maximum error of an inverse model, as a share of the variance of actions, for actions to be obtained from planned states."""
+AHEAD = 1, 2, 4, 8
+"""Steps ahead of inverse models to choose from."""
 POLICY_STEPS = 3
 """Sampler steps of a policy of a user's data, unless given: closed-loop rates are those of 10 steps, in a third of the time."""
 REST = 0.2
@@ -83,43 +83,66 @@ class Acting:
     """How actions are obtained from plans of a user's data.
 
     With a controller, or without actions in the demonstrations, from the next planned state. Where plans are windows from the
-    present state, actions are those of the plan. Otherwise by an inverse model of the present and the next planned state, if it
-    explains the actions of demonstrations that were left out of its fit; if not, actions are those of the plan.
+    present state, actions are those of the plan. Otherwise actions are those of the plan, or of an inverse model of the present
+    state and the planned state some steps ahead: whichever follows plans of training concepts best, in a simulation by a forward
+    model. All models are regressions on the demonstrations that the model keeps.
 
     Args:
         model: model of a user's data.
         control: controller; ``None`` for none.
+        sampling: sampler of the plans that are simulated.
     """
 
-    def __init__(self, model: ConceptModel, control: Control | None) -> None:
+    def __init__(self, model: ConceptModel, control: Control | None, sampling: Sampling) -> None:
         columns = model.domain.plans.columns
         self.actions = list(action_columns(columns))
         self.states = [column for column in range(len(columns)) if column not in self.actions]
-        self._control, self._inverse = control, None
+        self._control, self._ahead = control, 1
+        self._inverse: Regression | None = None
         if control is not None:
-            self.words = "actions by the given controller from the next planned state"
+            self.words = ["actions by the given controller", "from the next planned state"]
         elif not self.actions:
-            self.words = "actions are the next planned state, as demonstrations have no actions"
+            self.words = ["actions are the next planned state", "as demonstrations have no actions"]
+        elif PRESENT in model.domain.observed:
+            self.words = ["actions as planned from the present state"]
         else:
-            examples = model.examples
-            assert examples is not None
-            states, actions = examples.states[..., self.states], examples.states[..., self.actions]
-            if PRESENT in model.domain.observed:
-                self.words = "actions as planned from the present state"
-                return
-            inverse = inverse_model(states, actions, examples.lengths)
-            self._inverse = inverse if inverse.error <= EXPLAINED else None
-            source = "actions by an inverse model from the next planned state" if self._inverse else "actions as planned"
-            self.words = f"{source}; such a model explains {max(1 - inverse.error, 0):.0%} of the variance of actions"
+            self._choose(model, sampling)
+
+    def _choose(self, model: ConceptModel, sampling: Sampling) -> None:
+        """Choose how plans are followed best."""
+        examples = model.examples
+        assert examples is not None
+        draws = [generator("cpu", 0, 2, row) for row in range(len(examples))]
+        seen = moved(examples.initial_states.observed, model.device)
+        plans = model.sample([model[text] for text in examples.concepts], 1, sampling, draws, seen)[:, 0].cpu()
+        parts = examples.states[..., self.states], examples.states[..., self.actions], examples.lengths
+        world, spread = forward_model(*parts), plans[..., self.states].flatten(0, 1).var(dim=0).sum().clamp(min=1e-12)
+        errors: dict[int, float] = {}
+        models: dict[int, Regression | None] = {
+            0: None,
+            **{ahead: inverse_model(*parts, ahead) for ahead in AHEAD if ahead < model.horizon},
+        }
+        for self._ahead, self._inverse in models.items():
+            state, apart = plans[:, 0, self.states].double(), []
+            for age in range(model.horizon - 1):
+                action = self(state.float(), plans, age)
+                state = state + world(torch.cat((state, action.double()), dim=1))
+                apart.append((state - plans[:, age + 1, self.states]).square().sum(dim=1).mean())
+            errors[self._ahead] = float(torch.stack(apart).mean() / spread)
+        self._ahead = min(errors, key=lambda ahead: errors[ahead])
+        self._inverse = models[self._ahead]
+        source = f"by an inverse model, {counted(self._ahead, 'step')} ahead" if self._ahead else "as planned"
+        self.words = [f"actions {source}", f"simulated error {errors[self._ahead]:.2g} of the variance"]
 
     def __call__(self, present: Tensor, plans: Tensor, age: int) -> Tensor:
         """Actions ``(episode, action)`` at a time (``age``) of plans ``(episode, horizon, column)``."""
-        following = plans[:, min(age + 1, plans.shape[1] - 1), self.states]
+        last = plans.shape[1] - 1
+        following = plans[:, min(age + max(self._ahead, 1), last), self.states]
         if self._control is not None:
             return torch.as_tensor(np.asarray(self._control(present.numpy(), following.numpy()), dtype=np.float32))
         if self._inverse is not None:
             return self._inverse(torch.cat((present.double(), following.double() - present.double()), dim=1))
-        return plans[:, min(age, plans.shape[1] - 1), self.actions] if self.actions else following
+        return plans[:, min(age, last), self.actions] if self.actions else following
 
 
 class Plans:
@@ -212,18 +235,18 @@ class Policy(Shown):
         self.model, self.concept, self.execute = model, baked(model, concept), execute
         self._sampling, self._observe, self._seed = sampling, observe, seed
         # A user's data have examples and no environment.
-        self._acting = Acting(model, act) if model.domain.closed_loop is None and model.examples is not None else None
+        self._acting = Acting(model, act, sampling) if model.domain.closed_loop is None and model.examples is not None else None
         if self._acting is None:
             closed_loop_of(model.domain)
             require(act is None, "act", f"none, as {model.domain.name} has a planner", "a controller")
-        self.words = "actions by the domain's planner" if self._acting is None else self._acting.words
+        self.words = ["actions by the domain's planner"] if self._acting is None else self._acting.words
         self._following: Follower | None = None
         self._step, self._batch = 0, False
 
     def _words(self) -> Iterator[str]:
         yield repr(self.model.domain.name)
         yield f"a plan every {counted(self.execute, 'step')}"
-        yield self.words
+        yield from self.words
 
     def following(self, count: int, seed: int) -> Follower:
         """Policy of ``count`` episodes in lockstep, whose noise depends on seed and episode."""

@@ -18,6 +18,7 @@ from ftl_lightning.evaluation.pictures import gif
 from ftl_lightning.evaluation.policy import Policy
 from ftl_lightning.services.errors import UserError, require, short, shown
 from ftl_lightning.services.progress import bar
+from ftl_lightning.services.randomness import EVALUATION_SEED
 from ftl_lightning.services.tensor_file import atomic
 from ftl_lightning.services.text import Shown, counted
 
@@ -194,7 +195,10 @@ class _Record:
         def failed(row: int) -> None:
             self.failed[row] = True
 
-        lock_step(environments, lambda row: environments[row].reset(seed=self._seed + row)[0], act, steps, seen, failed, advance)
+        def reset(row: int) -> Any:
+            return environments[row].reset(seed=EVALUATION_SEED + self._seed + row)[0]
+
+        lock_step(environments, reset, act, steps, seen, failed, advance)
 
 
 def _successes(

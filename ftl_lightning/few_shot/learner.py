@@ -604,7 +604,7 @@ class FewShot(Shown):
         Args:
             policy: such as :meth:`policy` returns.
             environment: name of a registered environment, a function that makes it, or an environment, in which episodes run one
-                after another. Episode i is reset with the seed ``seed + i``.
+                after another. Their seeds are far from small numbers, with which demonstrations are often recorded.
             episodes: number of episodes.
             success: ``'info.KEY'``, a key of the ``info`` of an episode's last step, or a function of this ``info``; ``None`` for
                 ``is_success`` or ``success``, if there is such a key.
