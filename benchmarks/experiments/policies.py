@@ -30,8 +30,8 @@ from numpy.typing import NDArray
 from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.few_shot.learner import FewShot
 
-SHOWN, FEW, EPISODES, FIRST = 60, 5, 50, 10_000
-"""Demonstrations of each training concept and of a new one, episodes of a cell, and the seed of the first."""
+SHOWN, FEW, EPISODES = 60, 5, 50
+"""Demonstrations of each training concept and of a new one, and episodes of a cell."""
 
 
 class Goals(gymnasium.Env[Any, Any]):
@@ -225,16 +225,12 @@ def main() -> None:
                                 partial(make, task, noise),
                                 EPISODES,
                                 "info.is_success",
-                                seed=FIRST,
                             )
                             row = {"set": name, "task": text, "seed": seed, "form": form, "settings": label, "noise": noise}
                             row |= {"success": round(episodes.success, 4), "seconds": round(seconds, 1)}
                             rows.append({**row, "milliseconds": [round(value, 2) for value in episodes.latency]})
                             print(json.dumps(rows[-1]), flush=True)
-            known = {
-                other: model.rollout(model.policy(model[other]), partial(make, task), EPISODES, seed=FIRST).success
-                for other in training
-            }
+            known = {other: model.rollout(model.policy(model[other]), partial(make, task), EPISODES).success for other in training}
             best = max(known, key=lambda other: known[other])
             rows.append({"set": name, "task": text, "form": "best training concept", "concept": best, "success": known[best]})
             options.out.write_text(json.dumps(rows, indent=1) + "\n", "utf-8")
