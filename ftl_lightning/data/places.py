@@ -134,7 +134,7 @@ def places(demonstrations: Demonstrations, horizon: int) -> Places:
                 break
         else:
             parts |= {name: values} if values.shape[1] <= width else {}
-    followed = set(found) - begin
+    followed = [name for name in found if name not in begin]
     for name, values in parts.items():
         whole = feature_of(name, vectors)
         kin = [other for other in followed if _alike(values, parts[other])] if name not in found else []
