@@ -275,10 +275,10 @@ def domain_from_file(
     usual = longest if longest <= LONGEST_PLAN else WINDOW
     acts = list(action_columns(demonstrations.state_names))
     if acts and (context := context_of(demonstrations)):
-        note(f"{short(context, 80)}: columns that are constant in each demonstration are observed")
+        note(f"{path}: {short(context, 80)}: columns that are constant in each demonstration are observed")
         demonstrations = with_context(demonstrations, context)
         acts = list(action_columns(demonstrations.state_names))
-    followed = places(demonstrations, longest)
+    followed = places(demonstrations, longest) if acts else {}
     if acts and horizon is None and not followed and longest > LEAST_WINDOWS * ACTED and _follows(demonstrations, acts):
         horizon, whole = ACTED, f"--data.horizon {longest} makes them whole"
         note(f"data.horizon: actions follow the present state, so plans are windows of {horizon}; {whole}")

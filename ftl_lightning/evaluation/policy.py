@@ -1,4 +1,4 @@
-"""Receding-horizon policies: plans of a concept, executed in a domain's environment or in one's own."""
+"""Receding-horizon policies: plans of a concept, executed in an environment of a domain or of the user."""
 
 import copy
 from collections.abc import Callable, Collection, Iterator, Mapping

@@ -25,7 +25,6 @@ from ftl_lightning.services.text import Shown, counted
 if TYPE_CHECKING:
     import gymnasium
 
-Environment = "str | Callable[[], gymnasium.Env[Any, Any]] | gymnasium.Env[Any, Any]"
 SUCCESSES = ("is_success", "success")
 """Keys of success in an environment's ``info``, tried in this order."""
 SIDE_BY_SIDE = 16

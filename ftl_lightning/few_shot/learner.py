@@ -565,14 +565,14 @@ class FewShot(Shown):
     ) -> Policy:
         """Make a receding-horizon policy of a concept, for one environment or a batch of them.
 
-        With a user's data, plans are whole behaviour, from where an episode begins and through the present state.
+        With a user's data, plans are whole behaviour through the present state, or windows that begin there.
 
         Args:
             concept: as in :meth:`sample`.
             execute: number of steps of a plan that are executed (an action chunk).
             replan: steps between plans; ``None`` for ``execute``.
             act: with a user's data, controller ``(present states (episode, state), next planned states) -> actions``, arrays;
-                ``None`` for the actions of the data: by an inverse model if it explains them, else as planned. The policy's text
+                ``None`` for actions as planned or by an inverse model, whichever follows simulated plans best; the policy's text
                 says which.
             observe: function of an observation that returns what :meth:`Policy.act
                 <ftl_lightning.evaluation.policy.Policy.act>` accepts; ``None`` for the observation itself.
@@ -599,7 +599,7 @@ class FewShot(Shown):
         steps: int | None = None,
         seed: int = 0,
     ) -> Episodes:
-        """Evaluate a policy in a Gymnasium environment of one's own.
+        """Evaluate a policy in a Gymnasium environment.
 
         Args:
             policy: such as :meth:`policy` returns.
