@@ -2,7 +2,7 @@
 
 import pytest
 
-from ftl_lightning.few_shot.composition_text import Part, parse_composition
+from ftl_lightning.igm.composition import Part, parse_composition
 from ftl_lightning.services.errors import UserError
 
 

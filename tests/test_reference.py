@@ -23,7 +23,7 @@ ENTRANCE = [
     "ftl_lightning.igm.concept",
     "ftl_lightning.igm.forms.modes",
     "ftl_lightning.data.demonstrations",
-    "ftl_lightning.evaluation.execution",
+    "ftl_lightning.few_shot.plans",
     "ftl_lightning.few_shot.learner",
     "ftl_lightning.few_shot.learned_concept",
     "ftl_lightning.igm.library",

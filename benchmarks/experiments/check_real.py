@@ -19,8 +19,7 @@ from real_data import FEW, FEW_SEED, FRESH_SEED, NAMES, REAL, RULE, RealSet, set
 
 from ftl_lightning.data.check import check
 from ftl_lightning.data.demonstrations import concatenate
-from ftl_lightning.data.enough import Enough
-from ftl_lightning.data.odd import Oddness
+from ftl_lightning.data.enough import Enough, Oddness
 from ftl_lightning.data.references import WARPED, Reference, Setting
 from ftl_lightning.services.randomness import generator
 

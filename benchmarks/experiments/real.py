@@ -31,7 +31,7 @@ from torch import Tensor
 
 from ftl_lightning.data import references
 from ftl_lightning.data.demonstrations import concatenate
-from ftl_lightning.data.energy import PathFeatures
+from ftl_lightning.data.distances import PathFeatures
 from ftl_lightning.data.places import first_windows
 from ftl_lightning.data.references import GAUSSIAN, WARPED, Reference, Setting
 from ftl_lightning.few_shot.learner import FewShot

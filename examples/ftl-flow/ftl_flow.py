@@ -36,7 +36,7 @@ class FlowConfig(ModelConfig):
 class FlowModel(TextConceptModel):
     """A velocity field from noise to behaviour, given a concept; concepts are composed by Eq. 2 of the paper."""
 
-    method, Config, invertible = METHOD, FlowConfig, True
+    kind, Config, invertible = METHOD.kind, FlowConfig, True
 
     def __init__(self, prepared: Prepared[FlowConfig]) -> None:
         super().__init__(prepared)

@@ -228,7 +228,7 @@ def _sample_starts(options: SampleOptions, domain: "Domain") -> "InitialStates |
 
 def _start_task(options: SampleOptions, domain: "Domain") -> str:
     """Task of the initial states; empty without a task that the domain can read."""
-    from ftl_lightning.few_shot.composition_text import parse_composition
+    from ftl_lightning.igm.composition import parse_composition
     from ftl_lightning.igm.concept import Concept
 
     learned = (Concept.load(options.concept).origin.name,) if options.concept and not options.goal else ()

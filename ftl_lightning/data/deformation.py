@@ -1,4 +1,4 @@
-"""How behaviour of a concept varies: by place, affine shape and pace, which carry to other concepts, and a rest."""
+"""Deformations of paths: variation within a concept by place, affine shape, pace and a rest; corrections at pinned states."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -87,3 +87,36 @@ def _ridge(gram: Tensor, products: Tensor) -> Tensor:
     size = gram.diagonal(dim1=1, dim2=2).mean(dim=1).clamp(min=_LEAST)
     eye = torch.eye(gram.shape[1], device=gram.device, dtype=gram.dtype)
     return torch.linalg.solve(gram + RIDGE * size[:, None, None] * eye, products)
+
+
+REACH = 0.1
+"""Standard deviation of the correction around a pinned state, as a share of the horizon."""
+
+
+class Pinned:
+    """Known states of plans, such as the initial state: every estimate of the clean plans is conditioned on them.
+
+    Diffuser (Janner et al., 2022) replaces the known states alone, which leaves a step beside each. Here the correction is the
+    conditional mean of a Gaussian process of time: it is exact at the known times and fades over a share :data:`REACH` of the plan.
+
+    Args:
+        mask: known numbers ``(batch, horizon, state)`` of bool; the times of a column are the same in all plans.
+        values: their values in the same shape, normalised; ignored elsewhere.
+    """
+
+    def __init__(self, mask: Tensor, values: Tensor) -> None:
+        self.mask, self.values = mask, values
+        time = torch.arange(mask.shape[1], dtype=torch.float64, device=mask.device)
+        kernel = torch.exp(-0.5 * ((time[:, None] - time) / max(REACH * len(time), 1e-6)).square())
+        weights = torch.zeros(mask.shape[2], len(time), len(time), dtype=torch.float64, device=mask.device)
+        for column, known in enumerate(mask[0].T):
+            if known.any():
+                among = kernel[known][:, known] + 1e-9 * torch.eye(int(known.sum()), dtype=torch.float64, device=mask.device)
+                weights[column][:, known] = torch.linalg.solve(among, kernel[known]).T
+        self.weights = weights.to(values.dtype)
+
+    def __call__(self, clean: Tensor) -> Tensor:
+        """Condition estimates ``(batch, horizon, state)``."""
+        missing = torch.where(self.mask, self.values - clean, 0)
+        moved = clean + torch.einsum("cts,bsc->btc", self.weights, missing)
+        return torch.where(self.mask, self.values, moved)

@@ -7,9 +7,9 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
+from ftl_lightning.data.deformation import Pinned
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import Observed
-from ftl_lightning.data.pinned import Pinned
 from ftl_lightning.data.places import Frames, Places, feature_of, first_windows, frames_of, place_of, places, starts, vectors_of
 from ftl_lightning.services.errors import require, short
 from ftl_lightning.services.validation import check_range, from_mapping

@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from ftl_lightning.data.actions import CONTEXT, PRESENT, Regression, action_columns, forward_model, inverse_model
+from ftl_lightning.data.deformation import Pinned
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import PINNED, Observed, moved
-from ftl_lightning.data.pinned import Pinned
 from ftl_lightning.domains.domain import closed_loop_of
 from ftl_lightning.evaluation.closed_loop import PlanFollower, planner, sampled_plans
 from ftl_lightning.igm.composition import Composition

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.domain import Domain
-from ftl_lightning.few_shot.shared_concept import write_folder
+from ftl_lightning.few_shot.shared_concept import upload, write_folder
 from ftl_lightning.few_shot.tuned import ModelSettings
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import Concept
@@ -17,7 +17,6 @@ from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.modes import usual_modes
 from ftl_lightning.services.validation import check_whole
 from ftl_lightning.training.concept_model import ConceptModel
-from ftl_lightning.training.hub import upload
 from ftl_lightning.training.quality import Inspection, inspected
 
 

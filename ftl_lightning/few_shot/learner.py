@@ -18,7 +18,6 @@ from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import PINNED, InitialStates, moved
 from ftl_lightning.domains.domain import Domain, closed_loop_of
 from ftl_lightning.evaluation.closed_loop import reset
-from ftl_lightning.evaluation.execution import Execution, episodes
 from ftl_lightning.evaluation.policy import POLICY_STEPS, Control, Policy
 from ftl_lightning.evaluation.rollout import Episodes, rollout
 from ftl_lightning.few_shot.arrays import (
@@ -31,12 +30,11 @@ from ftl_lightning.few_shot.arrays import (
     scenes_of,
     starts_of,
 )
-from ftl_lightning.few_shot.batches import plans_of, sampled
-from ftl_lightning.few_shot.composition_text import Part, parse_composition
 from ftl_lightning.few_shot.learned_concept import LearnedConcept, Learning
-from ftl_lightning.few_shot.shared_concept import read_folder
+from ftl_lightning.few_shot.plans import Execution, episodes, plans_of, sampled
+from ftl_lightning.few_shot.shared_concept import CONCEPT_FILES, download, is_repository, read_folder, save_with_card, upload
 from ftl_lightning.few_shot.tuned import ModelSettings, settings_of
-from ftl_lightning.igm.composition import Composition, space_of
+from ftl_lightning.igm.composition import Composition, Part, parse_composition, space_of
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.igm.inversion import Watch
 from ftl_lightning.igm.library import Library, library
@@ -52,7 +50,6 @@ from ftl_lightning.services.trust import vouching
 from ftl_lightning.services.validation import LARGEST_STEP, changed, check_path, check_text, check_whole, device_named
 from ftl_lightning.training.checks import Check, check_concept, check_with, notes_of
 from ftl_lightning.training.concept_model import ConceptModel
-from ftl_lightning.training.hub import CONCEPT_FILES, download, is_repository, save_with_card, upload
 from ftl_lightning.training.model_folder import load_model
 from ftl_lightning.training.quality import judged, judging_domain, picture
 

@@ -6,10 +6,9 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor, nn
 
-from ftl_lightning.data.deformation import Deformations
+from ftl_lightning.data.deformation import Deformations, Pinned
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import Observed
-from ftl_lightning.data.pinned import Pinned
 from ftl_lightning.igm.composition import Composition, batched
 from ftl_lightning.igm.concept import Origin
 from ftl_lightning.igm.diffusion import Context, add_noise, denoising_loss, loss_weights, timesteps

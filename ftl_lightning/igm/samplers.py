@@ -4,7 +4,7 @@ Each sampler has the arguments ``epsilon``, noise estimate ``(x (batch, horizon,
 :func:`~ftl_lightning.igm.guidance.composed_epsilon`; ``noise``, which draws standard normal noise ``(batch, horizon, state)`` and
 is the only source of randomness; ``alpha_bar (T,)``, the schedule of pretraining; ``steps``, the number of timesteps visited,
 from 1 to T; ``temperature``, the paper's alpha, a factor of the variance of the initial noise and of all later noise; ``pinned``,
-states that a plan has to pass, see :class:`~ftl_lightning.data.pinned.Pinned`.
+states that a plan has to pass, see :class:`~ftl_lightning.data.deformation.Pinned`.
 """
 
 import itertools
@@ -16,7 +16,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from ftl_lightning.data.pinned import Pinned
+from ftl_lightning.data.deformation import Pinned
 from ftl_lightning.igm.diffusion import clean_from_epsilon
 from ftl_lightning.services.errors import require
 from ftl_lightning.services.validation import check_count, check_factor

@@ -10,7 +10,7 @@ from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.igm.settings import AdapterOptions
-from ftl_lightning.methods.declared import LANGUAGE
+from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.networks.text_encoder import load_encoder
 from ftl_lightning.services.errors import require
 from ftl_lightning.training.adaptation import Adaptation, Labels
@@ -35,7 +35,7 @@ class LanguageAdaptation(Adaptation):
         UserError: for a model of another method or encoder.
     """
 
-    labels = Labels(LANGUAGE.name)
+    labels = Labels("language")
 
     def __init__(
         self,
@@ -56,7 +56,7 @@ class LanguageAdaptation(Adaptation):
 
     @classmethod
     def adapts(cls, model: type[ConceptModel]) -> bool:
-        return model.method.kind == LANGUAGE.kind
+        return issubclass(model, GenerativeModel)
 
     def _embedding(self, goal: str) -> Tensor:
         """Embed a task's description, ``(1, 1, n)``."""

@@ -10,7 +10,6 @@ from ftl_lightning.data.features import Observed
 from ftl_lightning.igm.composition import Composition, batched
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.methods.bases import AdditiveModel, StepConfig, added, unroll
-from ftl_lightning.methods.declared import BC
 from ftl_lightning.services.validation import check_range
 from ftl_lightning.training.concept_model import TextConceptModel
 from ftl_lightning.training.model_config import Prepared
@@ -53,7 +52,7 @@ class ParallelMLP(nn.Module):
 class CloningModel(AdditiveModel, TextConceptModel):
     """Deterministic policy of the concept and, if observed, the state; composing adds concepts."""
 
-    method = BC
+    kind = "bc"
     Config = CloningConfig
     config: CloningConfig
 

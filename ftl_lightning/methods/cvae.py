@@ -10,7 +10,6 @@ from ftl_lightning.data.features import Observed
 from ftl_lightning.igm.composition import Composition, batched
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.methods.bases import AdditiveModel, added
-from ftl_lightning.methods.declared import CVAE
 from ftl_lightning.training.model_config import ModelConfig, Prepared
 
 
@@ -28,7 +27,7 @@ class VAEConfig(ModelConfig):
 class VAEModel(AdditiveModel):
     """VAE of behaviour, conditioned on the initial state. A concept is a value of the latent z; composing adds concepts."""
 
-    method = CVAE
+    kind = "cvae"
     Config = VAEConfig
     config: VAEConfig
 

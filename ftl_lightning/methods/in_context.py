@@ -13,7 +13,6 @@ from ftl_lightning.igm.composition import Composition, batched
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.methods.bases import StepConfig, unroll
-from ftl_lightning.methods.declared import IN_CONTEXT
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.validation import LARGEST, check_range
 from ftl_lightning.training.concept_model import ConceptModel
@@ -54,7 +53,7 @@ class InContextModel(ConceptModel):
         UserError: for a width that is not a multiple of the heads.
     """
 
-    method = IN_CONTEXT
+    kind = "in-context"
     Config = InContextConfig
     config: InContextConfig
     start: Tensor

@@ -67,7 +67,7 @@ class Adaptation(pl.LightningModule, ABC):
             expected = f"a model of kind {' or '.join(kinds_for(self.adapts)) or 'another'}"
             other = "inversion_module.InversionModule" if self.model.invertible else "adaptation.LearnerAdaptation"
             hint = f"which model.class_path ftl_lightning.training.{other} adapts"
-            raise UserError(f"model.pretrained: expected {expected}, found {self.model.method.kind} in {pretrained}, {hint}")
+            raise UserError(f"model.pretrained: expected {expected}, found {self.model.kind} in {pretrained}, {hint}")
         self.domain = self.model.domain
         self._omega, self._output = omega, output
         self.concepts: tuple[str, ...] = ()

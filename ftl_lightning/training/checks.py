@@ -10,9 +10,8 @@ from torch import Tensor
 
 from ftl_lightning.data.check import Finding, axes, check
 from ftl_lightning.data.demonstrations import Demonstrations, paths_of
-from ftl_lightning.data.enough import Enough
+from ftl_lightning.data.enough import Enough, Oddness
 from ftl_lightning.data.features import moved
-from ftl_lightning.data.odd import Oddness
 from ftl_lightning.data.references import NAMES
 from ftl_lightning.igm.concept import KNOWN, Concept
 from ftl_lightning.igm.explanation import formula

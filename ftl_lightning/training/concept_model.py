@@ -28,7 +28,7 @@ from ftl_lightning.services.errors import UserError, require, short, shown
 from ftl_lightning.services.randomness import drawn
 from ftl_lightning.services.tensor_file import bytes_hash, serialise
 from ftl_lightning.services.text import Shown, counted
-from ftl_lightning.training.method import Method
+from ftl_lightning.training.method import Method, method_of
 from ftl_lightning.training.model_config import ModelConfig, Prepared, find_view
 
 _LOG = logging.getLogger(__name__)
@@ -55,8 +55,8 @@ class ConceptModel(Shown, nn.Module, ABC):
             the places do not explain, see :class:`~ftl_lightning.data.places.Frames`; ``None`` without places.
     """
 
-    method: ClassVar[Method]
-    """The model's method."""
+    kind: ClassVar[str]
+    """Kind of the model in ``config.json``, as in the declaration of its method."""
     Config: ClassVar[type[ModelConfig]]
     """Class of the model's configuration."""
     invertible: ClassVar[bool] = False
@@ -95,6 +95,11 @@ class ConceptModel(Shown, nn.Module, ABC):
     def _see(self) -> None:
         self.view = find_view(self.domain, self.config.view)
         self._perturb = self.view.perturb if self.config.perturb and self.view is not None else None
+
+    @property
+    def method(self) -> Method:
+        """The method of the model's kind."""
+        return method_of(self.kind)
 
     def _words(self) -> Iterator[str]:
         yield repr(self.config.domain)

@@ -146,6 +146,14 @@ def methods() -> Iterator[Method]:
     yield from (_loaded(name, reference) for name, reference in sorted(_offered().items()) if name not in SHIPPED)
 
 
+def method_of(kind: str) -> Method:
+    """The method with the network of a kind; ``UserError`` without any."""
+    for method in methods():
+        if method.model and method.kind == kind:
+            return method
+    raise UserError(f"kind: expected one of {', '.join(kinds())}, found {short(kind)!r}; install the method's package")
+
+
 def kinds() -> list[str]:
     """All kinds of pretrained models."""
     return [method.kind for method in methods() if method.model]

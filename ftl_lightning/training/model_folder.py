@@ -37,7 +37,7 @@ def save_model(model: ConceptModel, folder: str | Path) -> None:
     """
     folder, stored = Path(folder), model.stored()
     check_finite(stored, str(folder), "nothing was written; train it anew")
-    header = {"format": VERSION, "hash": model.hash, "kind": model.method.kind}
+    header = {"format": VERSION, "hash": model.hash, "kind": model.kind}
     with alone(folder):  # concurrent writes do not mix
         save_tensors(folder / WEIGHTS, KIND, stored, {"domain": model.config.domain})
         if model.examples is not None:
@@ -60,8 +60,8 @@ def read_model(kind: type[M], folder: str | Path, domain: Domain | None = None) 
     path = Path(folder) / CONFIG
     content = read_config(folder)
     with about(path):
-        if (actual := content.pop("kind")) != kind.method.kind:
-            raise UserError(f"key 'kind': expected {kind.method.kind!r}, found {actual!r}, the model of another method")
+        if (actual := content.pop("kind")) != kind.kind:
+            raise UserError(f"key 'kind': expected {kind.kind!r}, found {actual!r}, the model of another method")
         if domain is None and content["domain"] != OWN:
             domain = domain_of_file(content["domain"])
         del content["format"]

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from ftl_lightning.data.energy import PathFeatures, ceiling
+from ftl_lightning.data.distances import PathFeatures, ceiling
 
 
 def loops(count: int, seed: int, wave: float = 3.0) -> Tensor:

@@ -6,8 +6,7 @@ import torch
 
 from ftl_lightning.apps.benchmark.strokes import TRAINING, strokes
 from ftl_lightning.data.demonstrations import Demonstrations, concatenate
-from ftl_lightning.data.enough import HIGH, Enough
-from ftl_lightning.data.odd import Oddness
+from ftl_lightning.data.enough import HIGH, Enough, Oddness
 from tests.conftest import succeed
 
 

@@ -8,10 +8,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from ftl_lightning.data.deformation import Pinned
 from ftl_lightning.data.demonstrations import Demonstrations, concatenate
-from ftl_lightning.data.energy import among, apart
+from ftl_lightning.data.distances import among, apart
 from ftl_lightning.data.normalization import Normalization
-from ftl_lightning.data.pinned import Pinned
 from ftl_lightning.data.places import Places, frames_of
 from ftl_lightning.data.references import NAMES, SHIFTED, VARIED, Reference, Setting
 from ftl_lightning.domains.from_file import own_domain

@@ -28,6 +28,13 @@ from ftl_lightning.training.trainer import Trainer
 METHOD = Method("memory", kind="memory", model=lambda: Memory)
 
 
+@pytest.fixture(autouse=True)
+def offered(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Offer the method as an installed package does."""
+    known = {"memory": f"{__name__}:METHOD"}
+    monkeypatch.setattr("ftl_lightning.training.method._offered", lambda: known)
+
+
 @dataclass(frozen=True, kw_only=True)
 class MemoryConfig(ModelConfig):
     """Nothing beside what every model has; ``concept_dim`` is the size of a plan."""
@@ -36,7 +43,7 @@ class MemoryConfig(ModelConfig):
 class Memory(ConceptModel):
     """Gives back the plans that a concept consists of."""
 
-    method, Config = METHOD, MemoryConfig
+    kind, Config = METHOD.kind, MemoryConfig
 
     def sample(
         self,

@@ -13,14 +13,14 @@ from ftl_lightning.services.errors import UserError
 from ftl_lightning.training.adaptation import Adaptation, LearnerAdaptation
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.inversion_module import InversionModule, adaptation_of
-from ftl_lightning.training.method import SHIPPED, Form, Method, kinds, load_method, method_names, methods
+from ftl_lightning.training.method import SHIPPED, Form, Method, kinds, load_method, method_names, method_of, methods
 from ftl_lightning.training.model_folder import kinds_for, model_class
 from ftl_lightning.training.pretraining import Pretraining
 from tests.conftest import ROOT
 
 KINDS = ["diffusion", "bc", "cvae", "in-context"]
 MODULE = """
-from ftl_lightning.training.method import SHIPPED, Form, Method, kinds, load_method, method_names, methods
+from ftl_lightning.training.method import SHIPPED, Form, Method, kinds, load_method, method_names, method_of, methods
 from ftl_lightning.training.model_folder import kinds_for, model_class
 METHOD = Method(name="echo", kind="diffusion")
 NOTHING = "a text"
@@ -65,7 +65,7 @@ def test_each_has_its_classes(name: str) -> None:
         assert method.kind == "diffusion"
     else:
         assert issubclass(method.model(), ConceptModel)
-        assert method.model().method is method
+        assert method_of(method.model().kind) is method
         assert issubclass(method.pretraining(), Pretraining)
         assert model_class(method.kind) is method.model()
 

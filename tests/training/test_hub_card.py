@@ -7,8 +7,8 @@ import pytest
 import yaml
 from markdown_it import MarkdownIt
 
+from ftl_lightning.few_shot.shared_concept import model_card
 from ftl_lightning.services.text import line, markdown_item
-from ftl_lightning.training.hub import card
 from tests.test_outputs import NAMES
 
 BEGINNINGS = ["# x", "- x", "+ x", "1. x", "2) x", "---", "===", "- [ ] x", "", "   x", "-", "12345678901. x"]
@@ -19,7 +19,7 @@ MORE = ["```\nrm -rf ~\n```", "a\n---\nb: c", '"; !!python/object:os.system', "#
 def test_names_of_strangers_mean_nothing_in_a_card(name: str) -> None:
     config = SimpleNamespace(training_concepts=(name, "walk", name), horizon=3, state_dim=2, encoder=name)
     model: Any = SimpleNamespace(config=config, method=SimpleNamespace(name=name), domain=SimpleNamespace(name=name), hash="0" * 16)
-    _, header, body = card(model).split("---\n", 2)
+    _, header, body = model_card(model).split("---\n", 2)
     assert set(yaml.safe_load(header)) == {"library_name", "tags"}
     tokens = MarkdownIt("commonmark").enable("table").parse(body)
     assert [token.tag for token in tokens if token.type == "heading_open"] == ["h1"]

@@ -37,7 +37,7 @@ class ReplayConfig(ModelConfig):
 class ReplayModel(ConceptModel):
     """Draws among the plans that a concept holds."""
 
-    method, Config = METHOD, ReplayConfig
+    kind, Config = METHOD.kind, ReplayConfig
 
     def sample(
         self,

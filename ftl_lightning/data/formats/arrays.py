@@ -33,8 +33,16 @@ from numpy.typing import NDArray
 from ftl_lightning.data.actions import action_columns, held_actions
 from ftl_lightning.data.demonstrations import FORMATS, OBSERVED, Contents, Demonstrations, Format, gathered, stacked
 from ftl_lightning.data.features import check_single, check_whole, precise
-from ftl_lightning.data.formats.files import DAMAGED, MOST_ARRAYS, TEXTS, check_array, check_arrays, contents_of, write_npz
-from ftl_lightning.data.formats.matlab import check_matlab
+from ftl_lightning.data.formats.files import (
+    DAMAGED,
+    MOST_ARRAYS,
+    TEXTS,
+    check_array,
+    check_arrays,
+    check_matlab,
+    contents_of,
+    write_npz,
+)
 from ftl_lightning.services.errors import UserError, about, note, require, short
 from ftl_lightning.services.files import MOST_HEADER, MOST_TENSORS, check_readable, check_unpacked, raised
 from ftl_lightning.services.shipped import check_extra

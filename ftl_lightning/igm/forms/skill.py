@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.data.demonstrations import Demonstrations
-from ftl_lightning.data.energy import PathFeatures, among, apart, ceiling
+from ftl_lightning.data.distances import PathFeatures, among, apart, ceiling
 from ftl_lightning.data.features import moved
 from ftl_lightning.data.places import first_windows, frames_of, shift
 from ftl_lightning.data.references import NAMES, SHIFTED, Reference, Setting
@@ -53,9 +53,9 @@ class Drawn:
 class LeftOut:
     """Scores of candidates on left-out demonstrations of one concept, in the network's normalised columns.
 
-    A score is the mean of the energy scores of all features of :class:`~ftl_lightning.data.energy.PathFeatures`, each relative to
-    that of behaviour of all training concepts at random. The skill of samples is the score of fresh demonstrations divided by that
-    of the samples: 1 for fresh demonstrations, 0.5 for twice their score.
+    A score is the mean of the energy scores of all features of :class:`~ftl_lightning.data.distances.PathFeatures`, each relative
+    to that of behaviour of all training concepts at random. The skill of samples is the score of fresh demonstrations divided by
+    that of the samples: 1 for fresh demonstrations, 0.5 for twice their score.
 
     Args:
         model: frozen model.

@@ -8,14 +8,13 @@ import torch
 from torch import Tensor, nn
 
 from ftl_lightning import networks
+from ftl_lightning.data.deformation import Pinned
 from ftl_lightning.data.features import Observed, take
-from ftl_lightning.data.pinned import Pinned
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.diffusion import MOST_STEPS, PREDICTIONS, Context, Prediction, cosine_alpha_bar
 from ftl_lightning.igm.forms.adapter import LowRank, adaptable
 from ftl_lightning.igm.model import DiffusionModel, Draws
 from ftl_lightning.igm.samplers import Sampling
-from ftl_lightning.methods.declared import FTL_IGM
 from ftl_lightning.services.errors import require, short
 from ftl_lightning.services.spectrum import Spectrum, check_cosines
 from ftl_lightning.services.validation import check_range, from_mapping
@@ -73,7 +72,7 @@ def build_denoiser(config: DiffusionConfig) -> nn.Module:
 class GenerativeModel(DiffusionModel, TextConceptModel):
     """Conditional diffusion model of plans."""
 
-    method = FTL_IGM
+    kind = "diffusion"
     invertible = True
     Config = DiffusionConfig
     config: DiffusionConfig
