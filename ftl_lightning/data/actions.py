@@ -13,6 +13,8 @@ ACTION = "action"
 """First word of the names of columns of actions, where they are joined to the columns of states."""
 PRESENT = "present state"
 """Observed feature that is added to demonstrations with actions: the state from which a window begins."""
+INITIAL = "initial state"
+"""Observed feature that is added to demonstrations with actions whose plans are whole: the first state, without its actions."""
 CONTEXT = "context "
 """Beginning of the name of the observed feature that holds columns which do not change in a demonstration, such as goals; their
 names follow, separated by commas.
@@ -45,15 +47,16 @@ def named_actions(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def held_actions(actions: Tensor, lengths: Tensor, time: int) -> Tensor:
-    """Actions ``(demo, time, action)`` of demonstrations with as many actions as states, or with one less.
+    """Actions ``(demo, time, action)`` of demonstrations with as many actions as states, or with one less; of single numbers, too.
 
     Where the last state has none, the action before is repeated.
 
     Args:
-        actions: ``(demo, time, action)`` or ``(demo, time - 1, action)``.
+        actions: ``(demo, time, action)`` or ``(demo, time - 1, action)``, or the same without the last dimension.
         lengths: number of states of each demonstration ``(demo,)``.
         time: number of states that demonstrations are padded to.
     """
+    actions = actions[..., None] if actions.dim() == 2 else actions
     if actions.dim() != 3 or actions.shape[1] not in (time - 1, time) or len(actions) != len(lengths):
         return actions  # refused by the demonstrations
     last = (lengths - (1 if actions.shape[1] == time else 2)).clamp(min=0)

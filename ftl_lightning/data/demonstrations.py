@@ -202,7 +202,7 @@ class Demonstrations(Shown):
         texts = (concepts,) * count if isinstance(concepts, str) else tuple(concepts)
         numbers = torch.from_numpy(precise(whole.numpy()))
         if actions is not None:
-            attributes = {**attributes, "actions": held_actions(stacked(actions)[0].float(), lengths, whole.shape[1])}
+            attributes = {**attributes, "actions": held_actions(_stacked_actions(actions), lengths, whole.shape[1])}
         return cls(**{"states": numbers, "lengths": lengths, "concepts": texts, **unnamed, **attributes})
 
     def __len__(self) -> int:
@@ -472,6 +472,11 @@ def padded(behaviours: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
     lengths = torch.tensor([len(behaviour) for behaviour in behaviours])
     longest = int(lengths.max())
     return torch.cat([_padded(behaviour[None], longest) for behaviour in behaviours]), lengths
+
+
+def _stacked_actions(actions: Any) -> Tensor:
+    """Actions ``(demo, time, action)`` of arrays ``(time, action)``, or ``(time,)`` of single numbers."""
+    return stacked([array[:, None] if np.ndim(array) == 1 else array for array in map(np.asarray, actions)])[0].float()
 
 
 def stacked(states: Sequence[Any]) -> tuple[Tensor, Tensor]:

@@ -9,12 +9,14 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from ftl_lightning.data.actions import action_columns
+from ftl_lightning.data.actions import INITIAL, action_columns
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import Observed
 
 Places = Mapping[str, tuple[int, ...]]
-"""Columns of the state in the same frame as an observed vector, by the name of the feature, or of a part of it: ``goals[2:4]``."""
+"""Columns of the state in the same frame as an observed vector, by the name of the feature, or of a part of it: ``goals[2:4]``. A
+place that several groups of columns follow has several names: ``goal`` and ``goal at 4``, by the first column of the group.
+"""
 
 EQUAL = 1e-4
 """Maximum difference of the initial state from a feature that equals it, relative to the columns' range."""
@@ -22,10 +24,14 @@ FOLLOWED = 0.1
 """Maximum variance of the distance to a place, at the time at which a concept follows it most, relative to the place's variance."""
 STRICTLY = 0.01
 """The same for single numbers of a vector, of which some are alike a column by chance."""
+MOST_SPACE = 3
+"""Maximum number of columns of a position."""
 RIDGE, WINDOW = 0.01, 0.05
 """Ridge penalty of the shares with which paths follow places, relative to the places' mean square; half width of the window of
 times that share an estimate, as a share of the horizon.
 """
+UNMOVED = 0.01
+"""Minimum standard deviation of a column, relative to its places', for the column to show which places it follows."""
 ALIKE = 1.5
 """Maximum ratio of the standard deviations of two places of a kind; their means differ by at most a standard deviation."""
 MOST_ALIKE = 4
@@ -34,22 +40,21 @@ PRIOR = 0.01
 """Ridge penalty of the weights of known frames, relative to the mean square of what they explain."""
 
 
-_PART = re.compile(r"(.+)\[(\d+):(\d+)\]")
+_PART = re.compile(r"(.+?)(?:\[(\d+):(\d+)\])?(?: at \d+)?")
 
 
 def feature_of(name: str, features: Mapping[str, object]) -> str:
-    """Name of the feature that a place, or the feature of which it is a part."""
+    """Name of the feature that is a place, or of which a place is a part."""
     part = None if name in features else _PART.fullmatch(name)
     return part[1] if part else name
 
 
 def place_of(observed: Observed, name: str) -> Tensor:
     """Values of a place ``(sample, size)``."""
-    whole = feature_of(name, observed)
-    if whole == name:
-        return observed[name].flatten(1)
-    first, last = map(int, name[len(whole) + 1 : -1].split(":"))
-    return observed[whole].flatten(1)[:, first:last]
+    part = None if name in observed else _PART.fullmatch(name)
+    if part is None or part[2] is None:
+        return observed[feature_of(name, observed)].flatten(1)
+    return observed[part[1]].flatten(1)[:, int(part[2]) : int(part[3])]
 
 
 def first_windows(demonstrations: Demonstrations, horizon: int) -> Tensor:
@@ -99,27 +104,15 @@ def places(demonstrations: Demonstrations, horizon: int) -> Places:
         demonstrations: demonstrations of training concepts, several of each.
         horizon: number of states that are compared.
     """
-    paths, texts = first_windows(demonstrations, horizon), demonstrations.concepts
-    rows = [[row for row, text in enumerate(texts) if text == name] for name in dict.fromkeys(texts)]
-    found: dict[str, tuple[int, ...]] = dict(starts(demonstrations))
+    paths, rows = first_windows(demonstrations, horizon), list(demonstrations.rows_of.values())
+    found: dict[str, tuple[int, ...]] = {name: columns for name, columns in starts(demonstrations).items() if name != INITIAL}
     begin, width = set(found), _width(demonstrations)
-    vectors = vectors_of(demonstrations)
+    vectors = {name: values for name, values in vectors_of(demonstrations).items() if name != INITIAL}
 
     def best(values: Tensor) -> tuple[float, tuple[int, ...]]:
         """Least share of the variance beside the place that remains, and the columns."""
-        shares = {
-            columns: min(
-                (
-                    float((rest.var(dim=0) / values[some].var(dim=0)).amax(dim=1).min())
-                    for some in rows
-                    if len(some) > 2 and (values[some].var(dim=0) > 1e-12).all()
-                    for rest in [paths[some][..., list(columns)] - values[some][:, None]]
-                ),
-                default=float("inf"),
-            )
-            for columns in _windows(values.shape[1], demonstrations.state_units, width)
-        }
-        return min(((share, columns) for columns, share in shares.items()), default=(float("inf"), ()))
+        windows = _windows(values.shape[1], demonstrations.state_units, width)
+        return min(((_beside(paths, rows, values, columns), columns) for columns in windows), default=(float("inf"), ()))
 
     parts: dict[str, Tensor] = {}
     for name, values in vectors.items():
@@ -140,7 +133,52 @@ def places(demonstrations: Demonstrations, horizon: int) -> Places:
         kin = [other for other in followed if _alike(values, parts[other])] if name not in found else []
         if len(kin) >= 2 or any(whole == feature_of(other, vectors) for other in kin):
             found[name] = found[kin[0]]
+    if INITIAL in demonstrations.observed:
+        several = [
+            (f"{name} at {columns[0]}", columns)
+            for name, values in parts.items()
+            if name in found
+            for columns in _windows(values.shape[1], demonstrations.state_units, width)
+            if not set(columns) & set(found[name]) and _beside(paths, rows, values, columns) <= FOLLOWED
+        ]
+        found |= {**dict(several), **objects(demonstrations, horizon)}
     return found
+
+
+def objects(demonstrations: Demonstrations, horizon: int) -> Places:
+    """Parts of the initial state that other columns follow, such as the position of an object that a hand goes to.
+
+    With them are the initial positions of all these columns. Empty if no column follows others.
+
+    Args:
+        demonstrations: demonstrations of training concepts, several of each.
+        horizon: number of states that are compared.
+    """
+    paths, rows = first_windows(demonstrations, horizon), list(demonstrations.rows_of.values())
+    width = _width(demonstrations)
+    for size in range(min(width // 2, MOST_SPACE), 1, -1):
+        windows = _windows(size, demonstrations.state_units, width)
+        found = [
+            (first, columns)
+            for first in windows
+            for columns in windows
+            if not set(first) & set(columns) and _beside(paths, rows, paths[:, 0, list(first)], columns) <= FOLLOWED
+        ]
+        if found:
+            every = [*found, *((group, group) for group in dict.fromkeys(itertools.chain(*found)))]
+            return {f"{INITIAL}[{first[0]}:{first[-1] + 1}] at {columns[0]}": columns for first, columns in every}
+    return {}
+
+
+def _beside(paths: Tensor, rows: list[list[int]], values: Tensor, columns: tuple[int, ...]) -> float:
+    """Least variance of columns beside a place, relative to the place's, over concepts (``rows``) and times."""
+    shares = [
+        float((rest.var(dim=0) / values[some].var(dim=0)).amax(dim=1).min())
+        for some in rows
+        if len(some) > 2 and (values[some].var(dim=0) > 1e-12).all()
+        for rest in [paths[some][..., list(columns)] - values[some][:, None]]
+    ]
+    return min(shares, default=float("inf"))
 
 
 def _parts(name: str, values: Tensor, width: int) -> Iterator[dict[str, Tensor]]:
@@ -208,11 +246,12 @@ class Frames:
         if not named or count < 2:
             return cls({}, paths.new_zeros(0, horizon))
         spread = (paths - paths.mean(dim=0)).square().mean(dim=(0, 1)).sqrt()
-        scale = torch.where(spread > 0, spread, torch.inf)
         moved = paths.new_zeros(len(named), count, width)
         for number, (name, columns) in enumerate(named.items()):
             values = place_of(observed, name).to(paths)
             moved[number][:, list(columns)] = values - values.mean(dim=0)
+        varies = spread > UNMOVED * moved.square().mean(dim=1).amax(dim=0).sqrt()
+        scale = torch.where(varies, spread, torch.inf)
         regressors = (moved / scale).flatten(1)  # (place, demo * state)
         targets = ((paths - paths.mean(dim=0)) / scale).transpose(0, 1).flatten(1)  # (time, demo * state)
         time = torch.arange(horizon)

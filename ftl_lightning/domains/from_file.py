@@ -32,13 +32,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ftl_lightning.data.actions import CONTEXT, PRESENT, STILL, action_columns, follows_present
+from ftl_lightning.data.actions import CONTEXT, INITIAL, PRESENT, STILL, action_columns, follows_present
 from ftl_lightning.data.columns import check_precision
 from ftl_lightning.data.demonstrations import Demonstrations, held, in_sequence
 from ftl_lightning.data.distances import warped_distances
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.data.kinds import LINEAR, Columns, check_values, declared, resolved
-from ftl_lightning.data.places import places
+from ftl_lightning.data.places import objects, places
 from ftl_lightning.domains.comparison import Comparison
 from ftl_lightning.domains.domain import OWN, Concepts, Domain, Metric, Plans, Recordings, Split, View
 from ftl_lightning.domains.recognition import Recognition
@@ -104,6 +104,7 @@ class OwnDomain(Domain):
         if context and set(context.removeprefix(CONTEXT).split(",")) <= set(acted.state_names):
             acted = with_context(acted, context)
         acted = with_present(acted) if PRESENT in self.observed else acted
+        acted = with_initial(acted) if INITIAL in self.observed else acted
         fitted = super().fitted(replace(acted, domain=self.name), place)
         kinds = self.plans.kinds or (LINEAR,) * len(self.plans.columns)
         words = [[text.partition(" ")[0] for text in texts] for texts in (fitted.state_kinds or kinds, kinds)]
@@ -208,6 +209,13 @@ def with_present(demonstrations: Demonstrations) -> Demonstrations:
     return replace(demonstrations, observed=observed, per_step=(*demonstrations.per_step, PRESENT))
 
 
+def with_initial(demonstrations: Demonstrations) -> Demonstrations:
+    """Demonstrations that observe the initial state, without its actions."""
+    acts = action_columns(demonstrations.state_names)
+    first = demonstrations.states[:, 0, [column for column in range(demonstrations.states.shape[2]) if column not in acts]]
+    return replace(demonstrations, observed={**demonstrations.observed, INITIAL: first.float()})
+
+
 def _follows(demonstrations: Demonstrations, acts: list[int]) -> bool:
     """Whether actions follow the present state, see :func:`~ftl_lightning.data.actions.follows_present`."""
     rest = [column for column in range(demonstrations.states.shape[2]) if column not in acts]
@@ -278,6 +286,8 @@ def domain_from_file(
         note(f"{path}: {short(context, 80)}: columns that are constant in each demonstration are observed")
         demonstrations = with_context(demonstrations, context)
         acts = list(action_columns(demonstrations.state_names))
+    if acts and (horizon or usual) >= longest and objects(demonstrations, longest):
+        demonstrations = with_initial(demonstrations)
     followed = places(demonstrations, longest) if acts else {}
     if acts and horizon is None and not followed and longest > LEAST_WINDOWS * ACTED and _follows(demonstrations, acts):
         horizon, whole = ACTED, f"--data.horizon {longest} makes them whole"

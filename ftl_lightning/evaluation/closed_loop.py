@@ -105,7 +105,7 @@ def _episodes(loop: ClosedLoop, rows: range, rollout: Rollout, policy: Policy, a
 def lock_step(
     environments: "Mapping[int, gymnasium.Env[Any, Any]]",
     reset: Callable[[int], Any],
-    act: Callable[[list[int], int], NDArray[np.float32]],
+    act: Callable[[list[int], int], Sequence[Any] | NDArray[np.float32]],
     steps: int,
     seen: Seen,
     failed: Callable[[int], None],
@@ -146,7 +146,7 @@ def lock_step(
         if not active:
             break
         actions = act(active, step)
-        require(len(actions) == len(active), "planner", f"actions of {len(active)} episodes", f"shape {actions.shape}")
+        require(len(actions) == len(active), "planner", f"actions of {len(active)} episodes", len(actions))
         continuing = []
         for row, action in zip(active, actions, strict=True):
             advance()

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from ftl_lightning.data.actions import CONTEXT, PRESENT, Regression, action_columns, forward_model, inverse_model
+from ftl_lightning.data.actions import CONTEXT, INITIAL, PRESENT, Regression, action_columns, forward_model, inverse_model
 from ftl_lightning.data.deformation import Pinned
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import PINNED, Observed, moved
@@ -314,8 +314,8 @@ class Policy(Shown):
         else:
             vector = _numbers("observation", given)
             values = self._of_columns(vector) or _of_vector(vector, shapes, starts)
-        if PRESENT in features and STATE in values:
-            values[PRESENT] = values[STATE]
+        if STATE in values:
+            values |= {name: values[STATE] for name in (PRESENT, INITIAL) if name in features}
         for name, columns in self.model.starts.items():
             if name not in values and STATE in values:
                 values[name] = _numbers("state", values[STATE])[..., [self._acting.states.index(column) for column in columns]]

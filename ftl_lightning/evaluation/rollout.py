@@ -171,18 +171,22 @@ class _Record:
         """Run episodes in lockstep."""
         environments = {row: self._environments[row - rows.start] for row in rows}
         follow = self._policy.following(rows.stop, self._seed)
-        space = environments[rows.start].action_space
-        low, high = getattr(space, "low", None), getattr(space, "high", None)
+        space: Any = environments[rows.start].action_space
+        kinds = "a Box or Discrete action space"
+        require(hasattr(space, "low") or hasattr(space, "n"), "environment", kinds, shown(type(space).__name__))
+        first = getattr(space, "start", 0)  # of a Discrete space, whose actions are rounded
+        low, high = (np.full(1, first), np.full(1, first + space.n - 1)) if hasattr(space, "n") else (space.low, space.high)
 
-        def act(active: list[int], step: int) -> NDArray[np.float32]:
+        def act(active: list[int], step: int) -> list[Any]:
             each = [self._policy.observed(self._latest[row])[0] for row in active]
             observed = {name: torch.cat([one[name] for one in each]) for name in each[0]}
             with torch.inference_mode():
                 actions = follow(observed, active, step).numpy().astype(np.float32)
-            if low is None:
-                return actions
             require(actions.shape[1:] == low.shape, "act", f"actions of shape {low.shape}", actions.shape[1:])
-            return np.where(np.isfinite(actions), actions.clip(low, high), actions).astype(low.dtype)
+            limited = np.where(np.isfinite(actions), actions.clip(low, high), actions)
+            if hasattr(space, "n"):
+                return [int(np.rint(value)) if np.isfinite(value) else value for value in limited[:, 0]]
+            return list(limited.astype(low.dtype))
 
         def seen(row: int, step: int, observation: Any, reward: float, info: Mapping[str, Any]) -> None:
             self.begun = observation if self.begun is None else self.begun

@@ -32,6 +32,15 @@ def test_the_last_action_of_each_demonstration_is_repeated(acted: Demonstrations
     assert acted.rows([1]).actions.shape == (1, 6, 2)  # type: ignore[union-attr]
 
 
+def test_actions_of_single_numbers_need_no_column(tmp_path: Path) -> None:
+    numbers = [np.arange(len(path) - 1) % 2 for path in PATHS]
+    acted = Demonstrations.of(PATHS, "left", actions=numbers)
+    assert acted.actions is not None
+    assert acted.actions.shape == (2, 6, 1)
+    np.savez(tmp_path / "flat.npz", states=acted.states, lengths=acted.lengths, actions=acted.actions[..., 0])
+    assert torch.equal(Demonstrations.load(tmp_path / "flat.npz").actions, acted.actions)  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize("name", ["acted.npz", "acted.safetensors", "lerobot:acted", "minari:acted/test-v0"])
 def test_every_format_that_is_written_keeps_actions(
     acted: Demonstrations, name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path

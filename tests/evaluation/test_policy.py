@@ -240,6 +240,94 @@ def test_a_new_goal_is_reached_from_five_demonstrations(once: Once, flat: bool) 
         assert episodes.success >= 0.9, (task, episodes)
 
 
+class Thing(gymnasium.Env[Any, Any]):
+    """A hand and a thing, whose position is part of the state: the hand has to go to a target, or to carry the thing there."""
+
+    observation_space = Dict(state=Box(-3, 3, (4,), np.float32), goal=Box(-3, 3, (2,), np.float32))
+    action_space = Box(-0.2, 0.2, (2,), np.float32)
+
+    def __init__(self, task: tuple[bool, float, float, float]) -> None:
+        # Whether the thing is carried; shares of its first place and of the goal in the target, and the height above them.
+        self.carries, *self.task = task
+
+    @property
+    def target(self) -> Any:
+        return self.task[0] * self.begin + self.task[1] * self.goal + np.array([0, self.task[2]])
+
+    def _seen(self) -> dict[str, Any]:
+        return {"state": np.concatenate((self.hand, self.thing)).astype(np.float32), "goal": self.goal.astype(np.float32)}
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.hand, self.held, self.time = self.np_random.uniform(-0.1, 0.1, 2), False, 0
+        self.begin, self.goal = self.np_random.uniform(-1, 1, (2, 2))
+        self.thing = self.begin.copy()
+        return self._seen(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.hand, self.time = self.hand + np.clip(action, -0.2, 0.2), self.time + 1
+        self.held = self.carries and (self.held or bool(np.linalg.norm(self.hand - self.thing) < NEAR))
+        self.thing = self.hand.copy() if self.held else self.thing
+        right = bool(np.linalg.norm((self.thing if self.carries else self.hand) - self.target) < NEAR)
+        return self._seen(), 0.0, False, self.time == STEPS, {"is_success": right}
+
+    def demonstrations(self, text: str, count: int, seed: int) -> Demonstrations:
+        rng, paths, done, goals = np.random.default_rng(seed), [], [], []
+        for episode in range(count):
+            observation, path, acts = self.reset(seed=1000 * seed + episode)[0], [], []
+            for _ in range(STEPS):
+                path.append(observation["state"])
+                away = 0.5 * ((self.target if self.held or not self.carries else self.thing) - self.hand)
+                acts.append((away * min(1, 0.18 / np.linalg.norm(away)) + rng.normal(0, 0.003, 2)).astype(np.float32))
+                observation, *_ = self.step(acts[-1])
+            paths.append(np.array([*path, observation["state"]]))
+            done.append(np.array(acts))
+            goals.append(self.goal.astype(np.float32))
+        return Demonstrations.of(paths, text, actions=done, observed={"goal": torch.tensor(np.array(goals))})
+
+
+@pytest.mark.slow
+def test_a_hand_goes_to_a_thing_that_is_part_of_the_state(once: Once) -> None:
+    def fit(folder: Path) -> None:
+        from ftl_lightning.data.demonstrations import concatenate
+
+        tasks = {"above the thing": (False, 1, 0, 0.2), "above the goal": (False, 0, 1, 0.2), "carry it": (True, 0, 1, 0)}
+        parts = [Thing(task).demonstrations(text, 40, len(text)) for text, task in tasks.items()]
+        concatenate(parts).save("things.npz")
+        options = ["--data.encoder=hashing", "--data.metrics={}", "--trainer.logger.save_dir=.", "--trainer.max_steps=600"]
+        succeed("fit", f"--config={CONF / 'own.yaml'}", "--data.demonstrations=things.npz", *options)
+
+    model = FewShot.from_pretrained(once("things", fit) / "own" / "fit" / "pretrained")
+    assert model.model.config.places == {
+        "goal": (0, 1),
+        "goal at 2": (2, 3),
+        "initial state[2:4] at 0": (0, 1),
+        "initial state[2:4] at 2": (2, 3),
+        "initial state[0:2] at 0": (0, 1),
+    }
+    task = False, 0.5, 0.5, 0.0
+    concept = model.learn(Thing(task).demonstrations("to the middle", 5, 70), name="go to the middle")
+    episodes = model.rollout(model.policy(concept), lambda: Thing(task), episodes=30)
+    assert episodes.success >= 0.9, episodes
+
+
+def test_actions_of_a_discrete_space_are_rounded(quick: FewShot) -> None:
+    class Two(Goals):
+        action_space = gymnasium.spaces.Discrete(2)  # type: ignore[assignment]
+        taken: list[Any] = []  # noqa: RUF012
+
+        def step(self, action: Any) -> Any:
+            assert self.action_space.contains(action)
+            self.taken.append(action)
+            return super().step([0.1, 0.1])
+
+    with pytest.raises(UserError, match=r"act: expected actions of shape \(1,\), found \(2,\)"):
+        quick.rollout(quick.policy(quick["go to 0"]), Two, episodes=2)
+    one = quick.policy(quick["go to 0"], act=lambda present, following: present[:, :1])
+    assert not any(quick.rollout(one, Two, episodes=2).failed)
+    assert set(Two.taken) == {0, 1}
+
+
 @pytest.mark.slow
 def test_pendulums_are_swung_by_windows_from_the_present_state(once: Once) -> None:
     def swings(amplitude: float, count: int, seed: int) -> Demonstrations:
