@@ -82,7 +82,7 @@ class Plans:
             with a uniform ``share``. 1 is uniform. With 3, half of the windows start in the first eighth of a demonstration, for
             plans that cover the whole behaviour. Shorter windows start anywhere.
         at_rest: whether behaviour rests at the end of a demonstration. If so, windows may reach past the end, where the last state
-            is repeated. If not, windows stay within demonstrations, which must be long enough.
+            is repeated. If not, windows stay within demonstrations; shorter demonstrations are refused.
         groups: groups of columns by name, such as the legs of a body. A composition may restrict a concept to some groups.
         resolution: smallest variation of a column of states or observed vectors, in its unit; columns that vary by less count as
             constant.

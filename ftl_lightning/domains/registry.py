@@ -45,6 +45,7 @@ def load_domain(name: str) -> Domain:
         mend = "install its package or mend the name" if known else "mend its module"
         raise UserError(f"domain {name!r}: cannot be imported ({message}); {mend}") from error
     require(isinstance(domain, Domain), f"domain {name!r}", "a Domain", type(domain).__name__)
+    require(":" in name or domain.name == name, f"domain {name!r}", "a Domain of this name", f"{domain.name!r}; mend its package")
     return domain
 
 

@@ -310,7 +310,7 @@ class Policy(Shown):
             vectors = [key for key in NAMES if key in given and key not in features]
             vectors += [key for key, value in given.items() if key not in features and np.shape(value)[-1:] == shapes[STATE]]
             if vectors:
-                values[STATE] = given[vectors[0]]
+                values |= self._of_columns(_numbers("state", given[vectors[0]])) or {STATE: given[vectors[0]]}
         else:
             vector = _numbers("observation", given)
             values = self._of_columns(vector) or _of_vector(vector, shapes, starts)

@@ -111,7 +111,11 @@ class Check:
         lines += findings if rest <= 0 else [*findings[:MOST_FAULTS], f"  and {rest} more"]
         lines += [] if self.known is None else [f"  {self.known}"]
         lines += [f"  {self.combination}"] if self.combination else []
-        lines += [] if self.left_out is None else [f"  {line}" for line in self.left_out.lines(self.by_loss) if line]
+        lines += (
+            []
+            if self.left_out is None
+            else [f"  {line}" for line in self.left_out.lines(self.by_loss and self.enough is None) if line]
+        )
         lines += [] if self.enough is None else [f"  {self.enough}"]
         return "\n".join(lines)
 

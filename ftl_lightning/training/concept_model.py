@@ -28,7 +28,7 @@ from ftl_lightning.services.errors import UserError, require, short, shown
 from ftl_lightning.services.randomness import drawn
 from ftl_lightning.services.tensor_file import bytes_hash, serialise
 from ftl_lightning.services.text import Shown, counted
-from ftl_lightning.training.method import Method, method_of
+from ftl_lightning.training.method import Method, class_path, method_of
 from ftl_lightning.training.model_config import ModelConfig, Prepared, find_view
 
 _LOG = logging.getLogger(__name__)
@@ -67,6 +67,8 @@ class ConceptModel(Shown, nn.Module, ABC):
 
     def __init__(self, prepared: Prepared[ModelConfig]) -> None:
         super().__init__()
+        for name in ("kind", "Config"):
+            require(hasattr(type(self), name), class_path(type(self)), f"a class attribute {name!r}", "none")
         config, domain = prepared.config, prepared.domain
         self.config, self.domain = config, domain
         self.examples: Demonstrations | None = None

@@ -159,6 +159,9 @@ class PretrainingData(pl.LightningDataModule):
             self.training = concatenate([self.training, more])
         if self.more is not None:
             self.training = concatenate([self.training, self._read_more(self.more)])
+        shortest = int(self.training.lengths.min())
+        long_enough = self.domain.plans.at_rest or shortest >= self.horizon
+        require(long_enough, "data.horizon", f"at most {shortest}, as behaviour does not rest at the end", self.horizon)
         self.validation = source.split("validation", self.validation_per_concept, self.seed).fitted(self.domain.observed)
         if self.balance is not None:
             self._shares = shares(self.training, self.balance)

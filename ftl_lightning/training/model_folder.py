@@ -166,7 +166,8 @@ def load_model(folder: str | Path, domain: Domain | str | None = None) -> Concep
     folder = pretrained_folder(folder)
     kind = read_config(folder)["kind"]
     if (network := model_class(kind)) is None:
-        raise UserError(f"{Path(folder) / CONFIG}: key 'kind': expected one of {', '.join(kinds())}, found {short(kind)!r}")
+        expected = f"{Path(folder) / CONFIG}: key 'kind': expected one of {', '.join(kinds())}"
+        raise UserError(f"{expected}, found {short(kind)!r}; install the package that offers this method")
     return read_model(network, folder, load_domain(domain) if isinstance(domain, str) else domain)
 
 
