@@ -5,6 +5,7 @@ It works the same in ``fit``, ``validate``, ``test`` and after ``invert``, for a
 
 import logging
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import lightning.pytorch as pl
@@ -16,6 +17,7 @@ from ftl_lightning.evaluation.generation import Evaluable, Generation, TaskResul
 from ftl_lightning.evaluation.pictures import write_films
 from ftl_lightning.evaluation.references import lines, real_behaviour, references
 from ftl_lightning.evaluation.results import config_hash, configuration, rows
+from ftl_lightning.evaluation.rollout import Place, environment_of, played
 from ftl_lightning.evaluation.summary import hparams_of, own_rows, record
 from ftl_lightning.evaluation.tensorboard import draw, log_projector, log_test, setting_means
 from ftl_lightning.services.errors import require, shown
@@ -35,6 +37,11 @@ class Evaluator(pl.Callback):
             testing concepts of the domain, and for no suite with user demonstrations. Tasks whose concept was not learned are
             skipped; learned concepts outside all suites are judged by their name, if the domain can read it.
         closed_loop: execute plans when testing (``test``, ``invert``), in domains with an environment.
+        fit_episodes: number of episodes of each task that are executed at each evaluation of ``fit``, as curves; 0 for none.
+        environment: for a user's data, the environment in which policies of the concepts act, see
+            :func:`~ftl_lightning.evaluation.rollout.environment_of`; ``None`` for none.
+        success: ``'info.KEY'`` of the environment's success, see :meth:`FewShot.rollout
+            <ftl_lightning.few_shot.learner.FewShot.rollout>`.
         figures: number of samples per task in a TensorBoard figure; 0 for no figures.
         results: file to which rows are added when testing (``test``, ``invert``); ``None`` for ``results.csv`` in the log folder.
         references: measure reference policies when testing. The rows are equal for all methods, so a single run per seed suffices.
@@ -50,6 +57,9 @@ class Evaluator(pl.Callback):
         self,
         suites: Sequence[str] | None = None,
         closed_loop: bool = False,
+        fit_episodes: int = 0,
+        environment: str | None = None,
+        success: str | None = None,
         figures: int = 16,
         results: str | None = None,
         references: bool | None = None,
@@ -60,9 +70,11 @@ class Evaluator(pl.Callback):
     ) -> None:
         self.generation = Generation(**generation)
         check_count("evaluation.figures", figures, 0, 1000)
+        check_count("evaluation.fit_episodes", fit_episodes, 0)
         self.suites = None if suites is None else tuple(suites)
         self.closed_loop, self.figures, self.results, self.references = closed_loop, figures, results, references
         self.diversity, self.films, self.variant = diversity, films, variant
+        self.fit_episodes, self.environment, self.success = fit_episodes, environment, success
         self.judged: list[TaskResult] = []
         self._projected = False
 
@@ -78,7 +90,8 @@ class Evaluator(pl.Callback):
         """Evaluation settings by name."""
         generation = self.generation
         # Suites are included because batch sizes affect rounding.
-        return {
+        acted = {} if self.environment is None else {"environment": self.environment, "success": self.success}
+        return acted | {
             "suites": ", ".join(self._suite_names(data)),
             "samples": generation.samples,
             "sampler": generation.sampler,
@@ -108,7 +121,21 @@ class Evaluator(pl.Callback):
         expected = f"one of {', '.join(others)}" if others else f"none, as {module.domain.name} has no other"
         for name in self.generation.environments:
             require(name in others, "evaluation.environments", expected, shown(name))
+        if self.environment is not None:
+            own = loop is None and module.model.examples is not None
+            require(own, "evaluation.environment", f"none, as {module.domain.name} has its own", self.environment)
+            environment_of(self.environment, "evaluation.environment")
         self._tasks(module, _data(trainer))
+
+    def _acted(self, module: Evaluable, judged: Sequence[TaskResult], episodes: int) -> list[TaskResult]:
+        """The first ``episodes`` of each task, executed, in the domain's environment or in that of the user."""
+        if self.environment is not None:
+            compositions = [one for behaviour in judged if (one := module.composition(behaviour.task)) is not None]
+            place = Place(self.environment, self.success, episodes)
+            return played(module.model, judged, compositions, place, self.generation)
+        if not self.closed_loop or module.domain.closed_loop is None:
+            return list(judged)
+        return execute(module, [behaviour.first(episodes) for behaviour in judged], self.generation)
 
     on_fit_start = on_validation_start = on_test_start = _check
 
@@ -120,6 +147,9 @@ class Evaluator(pl.Callback):
         means: dict[str, float] = {}
         if trainer.is_global_zero:  # rank 0 evaluates, the other ranks wait
             self.judged = generate(module, self._tasks(module, data), self.generation, data.root)
+            if self.fit_episodes and trainer.state.fn == "fit":
+                acted = self._acted(module, self.judged, self.fit_episodes)
+                self.judged = [replace(full, outcomes=some.outcomes) for full, some in zip(self.judged, acted, strict=True)]
             means = setting_means((done.task.setting, *measured) for done in self.judged for measured in done.values.items())
         # Synchronise the global generators, from which a domain's evaluation may draw.
         means, random = trainer.strategy.broadcast((means, Random.now(pl_module.device, 0)))
@@ -134,8 +164,7 @@ class Evaluator(pl.Callback):
         module, data = evaluable(pl_module), _data(trainer)
         domain, settings = module.domain, self.settings(data)
         self.judged = generate(module, self._tasks(module, data), self.generation, data.root)
-        if self.closed_loop and domain.closed_loop is not None:
-            self.judged = execute(module, self.judged, self.generation)
+        self.judged = self._acted(module, self.judged, self.generation.samples)
         reference_lines = self._compare(domain, data) if self.judged else {}
         configured = configuration(module, data, settings, trainer)
         measured = rows(module, domain, self.judged, reference_lines, configured, self.variant)

@@ -124,6 +124,11 @@ class TaskResult:
         """Judge plans by the task's goal."""
         return cls(task, states, domain.measure(task.goal, states, starts), starts, demonstrations)
 
+    def first(self, count: int) -> Self:
+        """The first ``count`` samples, to be executed."""
+        rows = range(min(count, len(self.states)))
+        return replace(self, states=self.states[: len(rows)], starts=None if self.starts is None else self.starts.take([*rows]))
+
     def executed(self, rollout: Rollout, domain: Domain, environment: str = "", followed: Sequence[Tensor] | None = None) -> Self:
         """Add a rollout, judged by the task's goal; failed episodes are no success.
 

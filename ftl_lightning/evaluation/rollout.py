@@ -1,11 +1,14 @@
 """Episodes of a policy in a user's Gymnasium environment: success, returns, films and latency."""
 
+import importlib
+import inspect
 import math
 import statistics
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,14 +16,19 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ftl_lightning.domains.domain import SUCCESS
 from ftl_lightning.evaluation.closed_loop import lock_step
+from ftl_lightning.evaluation.generation import Generation, TaskResult
 from ftl_lightning.evaluation.pictures import gif
-from ftl_lightning.evaluation.policy import Policy
+from ftl_lightning.evaluation.policy import POLICY_STEPS, Policy
+from ftl_lightning.igm.composition import Composition
 from ftl_lightning.services.errors import UserError, require, short, shown
 from ftl_lightning.services.progress import bar
 from ftl_lightning.services.randomness import EVALUATION_SEED
 from ftl_lightning.services.tensor_file import atomic
 from ftl_lightning.services.text import Shown, counted
+from ftl_lightning.services.trust import OPTION, is_vouched
+from ftl_lightning.training.concept_model import ConceptModel
 
 if TYPE_CHECKING:
     import gymnasium
@@ -35,6 +43,20 @@ TIMED = 20
 """Number of chunks that measure the latency."""
 Z = 1.96
 """Standard normal quantile of a 95 % interval."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """A user's environment.
+
+    Attributes:
+        environment, success: see :func:`environment_of` and :meth:`FewShot.rollout`.
+        episodes: number of episodes of each task.
+    """
+
+    environment: str
+    success: str | None
+    episodes: int
 
 
 @dataclass(frozen=True, repr=False)
@@ -141,6 +163,55 @@ def rollout(
         first_time,
         tuple(record.frames),
     )
+
+
+def environment_of(reference: str, key: str) -> "Callable[[str], gymnasium.Env[Any, Any]]":
+    """Function that makes the environment of a goal's text.
+
+    Args:
+        reference: name of a registered environment, or ``'package.module:function'``. The function may take the goal's text. Its
+            module must be named by the user: a configuration file alone does not suffice, as the function runs.
+        key: option that holds the reference, for errors.
+
+    Raises:
+        UserError: for a module that the user did not name, or without such a function.
+    """
+    module, colon, name = reference.partition(":")
+    if not colon:
+        return lambda goal: _made(reference)
+    refused = f"{short(reference)!r} in a file; name it on the command line, or add {OPTION} {short(module)}"
+    require(is_vouched(reference), key, "a function that the command line names", refused)
+    try:
+        function = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError) as error:
+        raise UserError(f"{key}: expected 'package.module:function', found {short(str(error), 150)}") from error
+    require(callable(function), key, "a function", shown(function))
+    takes = bool(inspect.signature(function).parameters)
+    return lambda goal: _made(partial(function, goal) if takes else function)
+
+
+def played(
+    model: ConceptModel, judged: Sequence[TaskResult], compositions: Sequence[Composition], place: Place, generation: Generation
+) -> list[TaskResult]:
+    """Add episodes in a user's environment to results, with the outcomes ``success``, if it is known, and ``return``.
+
+    Args:
+        model: model of a user's data.
+        judged, compositions: results and their compositions.
+        place: environment, success, and number of episodes of each task.
+        generation: settings of the plans, of which a policy takes at most :data:`POLICY_STEPS` sampler steps.
+    """
+    make = environment_of(place.environment, "evaluation.environment")
+    sampling = replace(generation.sampling, steps=min(POLICY_STEPS, generation.steps))
+    results = []
+    for behaviour, composition in zip(judged, compositions, strict=True):
+        policy = Policy(model, composition, sampling, generation.replan)
+        episodes = rollout(policy, partial(make, behaviour.task.goal), place.episodes, place.success, seed=generation.seed)
+        outcomes = {"return": torch.tensor(episodes.returns)}
+        if episodes.successes is not None:
+            outcomes = {SUCCESS: torch.tensor(episodes.successes), **outcomes}
+        results.append(replace(behaviour, outcomes=outcomes))
+    return results
 
 
 def _made(environment: Any) -> "gymnasium.Env[Any, Any]":

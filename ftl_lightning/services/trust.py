@@ -122,12 +122,12 @@ def person(verb: str, arguments: Arguments) -> Iterator[Arguments]:
 
 
 def _named(verb: str, arguments: Arguments) -> set[str]:
-    """Domains ``module:ATTRIBUTE`` and modules of classes in the command line itself."""
+    """Domains and environments ``module:ATTRIBUTE``, and modules of classes, in the command line itself."""
     first = arguments.positional[:1] if verb in _POSITIONAL else ()
     names = {domain for domain in first if _REFERENCE.fullmatch(domain)}
     for option, value in arguments.options:
         last, value = option.rstrip("+").rpartition(".")[2], value or ""
-        if last == "domain" and _REFERENCE.fullmatch(value):
+        if last in ("domain", "environment") and _REFERENCE.fullmatch(value):
             names.add(value)
         if last in _CLASSES and _CLASS.fullmatch(value):
             names.add(value.rpartition(".")[0])

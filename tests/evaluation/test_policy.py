@@ -9,9 +9,12 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box, Dict
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from ftl_lightning import FewShot
+from ftl_lightning.cli.main import main
 from ftl_lightning.data.demonstrations import Demonstrations
+from ftl_lightning.evaluation.results import read_rows
 from ftl_lightning.services.errors import UserError
 from tests.conftest import CONF, Once, succeed
 
@@ -220,6 +223,50 @@ def test_policies_of_domains_with_an_environment_use_its_planner() -> None:
     assert np.isfinite(action).all()
     with pytest.raises(UserError, match="act: expected none"):
         model.policy(model[model.training_concepts[0]], act=lambda present, following: present)
+
+
+MODULE = """
+from tests.evaluation.test_policy import Goals
+
+def make(goal):
+    return Goals(int(goal.split()[-1]))
+
+def broken():
+    return 3
+"""
+
+
+def test_policies_act_in_an_environment_that_the_command_line_names(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("my_goals.py").write_text(MODULE)
+    from ftl_lightning.data.demonstrations import concatenate
+
+    concatenate([shown(task, 6, 1 + task) for task in (0, 1)]).save("goals.npz")
+    shown(2, 3, 9).save("three.npz")
+    few = ["--trainer.logger.save_dir=.", "--evaluation.figures=0", "--evaluation.samples=3"]
+    place = ["--evaluation.environment=my_goals:make", "--evaluation.success=info.is_success"]
+    fit = [f"--config={CONF / 'own.yaml'}", "--data.demonstrations=goals.npz", "--data.encoder=hashing", "--data.metrics={}"]
+    succeed("fit", *fit, *few, *place, "--evaluation.fit_episodes=2", "--trainer.max_steps=20", "--data.steps_per_epoch=10")
+    names = EventAccumulator("own/fit").Reload().Tags()["scalars"]
+    assert {"closed loop success/training concept", "closed loop return/training concept"} <= set(names)
+    invert = ["--data.demonstrations=three.npz", "--model.pretrained=own/fit/pretrained", "--data.steps=5", "--model.form=paper"]
+    succeed("invert", f"--config={CONF / 'own.yaml'}", *invert, *few, *place)
+    rows = {row.metric: row for row in read_rows("own/invert/results.csv").itertuples()}
+    assert rows["closed loop success"].task == "go to 2"
+    assert rows["closed loop success"].n == 3
+    assert rows["closed loop return"].value >= 0
+    Path("place.yaml").write_text("evaluation: {environment: 'my_goals:make'}")
+    for wrong, expected in (
+        (["--config=place.yaml"], "evaluation.environment: expected a function that the command line names"),
+        (["--evaluation.environment=my_goals:other"], "evaluation.environment: expected 'package.module:function'"),
+        (["--evaluation.environment=my_goals:broken"], "environment: expected a Gymnasium environment, found 3"),
+        (["--evaluation.environment=No-v0"], "environment: expected the name of a Gymnasium environment"),
+        ([*place[:1], "--evaluation.success=info.won"], "success: expected 'info.KEY' with one of is_success, distance"),
+    ):
+        assert main(["invert", f"--config={CONF / 'own.yaml'}", *invert, *few, *wrong]) == 2
+        assert expected in capsys.readouterr().err
 
 
 @pytest.mark.slow
