@@ -113,7 +113,7 @@ def test_every_link_of_a_notebook_points_to_something(path: Path) -> None:
 
 def test_tutorials_link_to_the_next_and_end_with_exercises() -> None:
     tutorials = sorted(TUTORIALS.glob("*.ipynb"))
-    assert len(tutorials) == 5
+    assert len(tutorials) == 6
     for path, following in zip(tutorials, (*tutorials[1:], tutorials[0]), strict=True):
         last = nbformat.read(path, as_version=4).cells[-1].source
         assert "## Exercises" in last

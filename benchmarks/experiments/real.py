@@ -131,7 +131,7 @@ def measured(data: RealSet, model: FewShot, kind: str, draw: int) -> dict[str, o
     for name, each in concepts.items():
         kept = model.sample(each, observed=observed, seed=draw) if observed else model.sample(each, count=count, seed=draw)
         plans[name] = kept.states
-    setting, truth, scores = Setting.of(examples, horizon), {}, {"chosen": score(sampled.states)}
+    setting, truth, scores = Setting.of(examples, horizon, model.model.places), {}, {"chosen": score(sampled.states)}
     for name in references.NAMES:
         draws = torch.Generator().manual_seed(draw)
         scores[name] = score(Reference.of(name, five, setting, horizon).sample(starts, count * EACH, draws))

@@ -13,7 +13,7 @@ from torch import Tensor
 from ftl_lightning.data.actions import held_actions, named_actions
 from ftl_lightning.data.features import Feature, InitialStates, Observed, check_whole, precise, take
 from ftl_lightning.data.kinds import KINDS, Paths
-from ftl_lightning.services.errors import UserError, about, require, short
+from ftl_lightning.services.errors import UserError, about, require, short, shown
 from ftl_lightning.services.files import MOST_RATIO, MOST_TENSORS, MOST_UNPACKED, raised, read_from, written_to
 from ftl_lightning.services.tensor_file import bytes_hash, serialise
 from ftl_lightning.services.text import Shown, counted
@@ -190,7 +190,7 @@ class Demonstrations(Shown):
             states: an array ``(time, state)`` for each demonstration.
             concepts: a text for each demonstration, or a single text for all.
             actions: an array ``(time, action)`` or ``(time - 1, action)`` for each demonstration; ``None`` if unknown.
-            attributes: further attributes of the class.
+            attributes: further attributes of the class; ``observed`` may hold arrays, too.
 
         Raises:
             UserError: for arrays of other shapes, or other attributes that do not fit.
@@ -201,6 +201,8 @@ class Demonstrations(Shown):
         unnamed = {"domain": "", "state_names": tuple(map(str, range(columns))), "state_units": ("",) * columns}
         texts = (concepts,) * count if isinstance(concepts, str) else tuple(concepts)
         numbers = torch.from_numpy(precise(whole.numpy()))
+        if "observed" in attributes:
+            attributes["observed"] = {name: _feature(name, values) for name, values in attributes["observed"].items()}
         if actions is not None:
             attributes = {**attributes, "actions": held_actions(_stacked_actions(actions), lengths, whole.shape[1])}
         return cls(**{"states": numbers, "lengths": lengths, "concepts": texts, **unnamed, **attributes})
@@ -472,6 +474,15 @@ def padded(behaviours: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
     lengths = torch.tensor([len(behaviour) for behaviour in behaviours])
     longest = int(lengths.max())
     return torch.cat([_padded(behaviour[None], longest) for behaviour in behaviours]), lengths
+
+
+def _feature(name: str, values: Any) -> Tensor:
+    """Tensor of an observed feature; numbers that are not uint8 in float32."""
+    try:
+        tensor = torch.as_tensor(values if isinstance(values, Tensor) else np.asarray(values))
+    except (TypeError, ValueError):
+        raise UserError(f"observed {name!r}: expected an array of numbers, found {shown(values)}") from None
+    return tensor if tensor.dtype == torch.uint8 else tensor.float()
 
 
 def _stacked_actions(actions: Any) -> Tensor:

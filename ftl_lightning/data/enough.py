@@ -13,7 +13,7 @@ from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.distances import PathFeatures, ceiling
 from ftl_lightning.data.features import Observed
 from ftl_lightning.data.kinds import Columns
-from ftl_lightning.data.places import Frames, first_windows, vectors_of
+from ftl_lightning.data.places import Frames, Places, first_windows, vectors_of
 from ftl_lightning.data.references import GAUSSIAN, SHIFTED, WARPED, Reference, Setting
 from ftl_lightning.services.randomness import generator
 
@@ -61,6 +61,7 @@ class Enough:
         training: Demonstrations | None = None,
         learned: tuple[str, float] | None = None,
         without: Collection[int] = (),
+        followed: Places | None = None,
     ) -> Self | None:
         """Measure demonstrations of one concept.
 
@@ -69,6 +70,7 @@ class Enough:
             training: demonstrations of training concepts, if there are any: what behaviour varies by.
             learned: a learned form that is better than every reference on left-out demonstrations, and its skill.
             without: demonstrations to leave out, as they are likely faulty.
+            followed: places that are known already.
 
         Returns:
             The result; ``None`` for fewer than :data:`FEWEST` demonstrations, or paths of more than :data:`LARGEST` numbers.
@@ -78,7 +80,7 @@ class Enough:
         count = len(demonstrations)
         if count < FEWEST or horizon * demonstrations.states.shape[2] > LARGEST:
             return None
-        every, fresh = _skills(demonstrations, horizon, training)
+        every, fresh = _skills(demonstrations, horizon, training, followed)
         sizes = sorted(next(iter(every.values())))
         last = sizes[-1]
         wanted = {name: _wanted(skills, count) for name, skills in every.items()}
@@ -138,13 +140,13 @@ def _wanted(skills: Mapping[int, float], count: int) -> int | None:
 
 
 def _skills(
-    demonstrations: Demonstrations, horizon: int, training: Demonstrations | None
+    demonstrations: Demonstrations, horizon: int, training: Demonstrations | None, followed: Places | None
 ) -> tuple[dict[str, dict[int, float]], float]:
     """Skill of references made from some of the demonstrations on others, by name and number of demonstrations, and score of fresh
     demonstrations relative to behaviour of all training concepts.
     """
     known = demonstrations if training is None else training
-    setting, columns = Setting.of(known, horizon), Columns(known.state_kinds)
+    setting, columns = Setting.of(known, horizon, followed), Columns(known.state_kinds)
     centre = columns.encode(known.states).flatten(0, 1).mean(dim=0)
 
     def encoded(paths: Tensor) -> Tensor:
@@ -201,10 +203,11 @@ class Oddness:
     Args:
         training: demonstrations of training concepts.
         horizon: number of states that are compared.
+        followed: places that are known already.
     """
 
-    def __init__(self, training: Demonstrations, horizon: int) -> None:
-        self.horizon, self.setting, self.columns = horizon, Setting.of(training, horizon), Columns(training.state_kinds)
+    def __init__(self, training: Demonstrations, horizon: int, followed: Places | None = None) -> None:
+        self.horizon, self.setting, self.columns = horizon, Setting.of(training, horizon, followed), Columns(training.state_kinds)
         self.centre = self.columns.encode(training.states).flatten(0, 1).mean(dim=0)
         self.paths, self.seen = first_windows(training, horizon), vectors_of(training)
         self.usual = {name: values.mean(dim=0, keepdim=True) for name, values in self.seen.items()}

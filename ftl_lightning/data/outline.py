@@ -9,7 +9,7 @@ from torch.nn import functional
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import Observed
 from ftl_lightning.data.kinds import Columns
-from ftl_lightning.data.places import Frames, first_windows, vectors_of
+from ftl_lightning.data.places import Frames, Places, first_windows, vectors_of
 from ftl_lightning.data.references import Setting
 from ftl_lightning.services.randomness import generator
 
@@ -36,10 +36,11 @@ class Outline:
     Args:
         training: demonstrations of training concepts.
         horizon: number of states of a path.
+        followed: places that are known already.
     """
 
-    def __init__(self, training: Demonstrations, horizon: int) -> None:
-        self.horizon, self.setting, self.columns = horizon, Setting.of(training, horizon), Columns(training.state_kinds)
+    def __init__(self, training: Demonstrations, horizon: int, followed: Places | None = None) -> None:
+        self.horizon, self.setting, self.columns = horizon, Setting.of(training, horizon, followed), Columns(training.state_kinds)
         self.paths, self.seen = first_windows(training, horizon), vectors_of(training)
         self.usual = {name: values.mean(dim=0, keepdim=True) for name, values in self.seen.items()}
         values = self.columns.encode(training.states).flatten(0, 1)

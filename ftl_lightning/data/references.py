@@ -50,8 +50,8 @@ class Setting:
     frames: Tensor
 
     @classmethod
-    def of(cls, training: Demonstrations, horizon: int) -> Self:
-        """Measure demonstrations of training concepts, two or more of each."""
+    def of(cls, training: Demonstrations, horizon: int, followed: Places | None = None) -> Self:
+        """Measure demonstrations of training concepts, two or more of each; ``followed`` are places that are known already."""
         paths, texts = first_windows(training, horizon), training.concepts
         spread = paths.flatten(0, 1).std(dim=0, correction=0)
         spread = torch.where(spread > 1e-6 * spread.max(), spread, torch.inf)
@@ -62,7 +62,7 @@ class Setting:
             place = torch.stack([some.mean(dim=1).var(dim=0) for some in several]).mean(dim=0).sqrt()
             sizes = torch.stack([_size(some, spread).log().var() for some in several]).mean().sqrt()
         seen = {name: values.std(dim=0, correction=0).clamp(min=1e-9) for name, values in vectors_of(training).items()}
-        followed = places(training, horizon)
+        followed = followed or places(training, horizon)
         return cls(followed, starts(training), seen, place, float(sizes), frames_of(training, horizon, followed))
 
 

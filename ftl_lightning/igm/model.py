@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from ftl_lightning.data.deformation import Deformations, Pinned
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import Observed
+from ftl_lightning.data.places import Places
 from ftl_lightning.igm.composition import Composition, batched
 from ftl_lightning.igm.concept import Origin
 from ftl_lightning.igm.diffusion import Context, add_noise, denoising_loss, loss_weights, timesteps
@@ -31,11 +32,13 @@ class Invertible(Protocol):
         device, hash, window: device of the parameters, hash of the pretrained model, number of states in a training window.
         training_embeddings: embeddings of the training concepts ``(training concept, n)``, centred: their mean is 0.
         examples: demonstrations of training concepts, for a user's data; else ``None``.
-        frames: shares of observed places in plans ``(training concept, place, horizon)``; ``None`` for a model without places.
+        places: columns of each observed place that plans follow.
+        frames: shares of the places in plans ``(training concept, place, horizon)``; ``None`` for a model without places.
     """
 
     training_embeddings: Tensor
     examples: Demonstrations | None
+    places: Places
     frames: Tensor | None
 
     @property
@@ -199,12 +202,9 @@ class DiffusionModel(nn.Module):
         """Sample normalised plans ``(composition * count, horizon, state)`` with the composed denoiser (section 4.3).
 
         Args:
-            compositions: compositions with weights ``(K,)``; K may differ between them.
-            count: number of plans for each composition.
-            sampling: sampler, number of steps and temperature.
-            generators: random generator of each composition.
-            context: encoded observed features of each plan.
-            pinned: known states of each plan, normalised; ``None`` for none.
+            compositions, count: compositions with weights ``(K,)``, where K may differ; number of plans of each.
+            sampling, generators: sampler, number of steps and temperature; random generator of each composition.
+            context, pinned: encoded observed features, and known normalised states, of each plan; ``None`` for none.
         """
         batch, row = batched(compositions, count, generators)
 

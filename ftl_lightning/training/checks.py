@@ -181,14 +181,14 @@ def check_with(
     with bar(titled, total, lines=False) if progress else nothing as advance:
         known = known_as(model, demonstrations, settings, advance)
     own, left, learned, odd = model.examples, None, None, None
-    if own is not None and (odd := Oddness(own, model.horizon).odd(demonstrations)) is not None:
+    if own is not None and (odd := Oddness(own, model.horizon, model.places).odd(demonstrations)) is not None:
         faults = (*faults, Finding("differs from the others more than is usual within a concept; another concept?", rows=(odd,)))
     if steps and len(demonstrations) > 1:
         find_odd = odd_one if own is None else lambda losses: odd
         with bar(f"{name}: learning from some", steps) if progress else nothing as advance:
             left = leave_one_out(model, demonstrations, settings, steps, lambda loss: advance(1, f"loss {loss:.3g}"), find_odd)
         learned = None if own is None else _best_learned(model, demonstrations, settings, steps)
-    enough = None if own is None else Enough.of(demonstrations, model.horizon, own, learned, faulty(faults))
+    enough = None if own is None else Enough.of(demonstrations, model.horizon, own, learned, faulty(faults), model.places)
     ordered = tuple(sorted(faults, key=lambda finding: finding.severity == "note"))
     return Check(name, demonstrations, ordered, known, left, combination_line(model, demonstrations, settings), enough, own is None)
 

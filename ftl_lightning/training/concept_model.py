@@ -70,7 +70,7 @@ class ConceptModel(Shown, nn.Module, ABC):
         for name in ("kind", "Config"):
             require(hasattr(type(self), name), class_path(type(self)), f"a class attribute {name!r}", "none")
         config, domain = prepared.config, prepared.domain
-        self.config, self.domain = config, domain
+        self.config, self.domain, self.places = config, domain, config.places
         self.examples: Demonstrations | None = None
         self._see()
         perturbs = not config.perturb or self._perturb is not None

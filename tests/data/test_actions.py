@@ -32,6 +32,15 @@ def test_the_last_action_of_each_demonstration_is_repeated(acted: Demonstrations
     assert acted.rows([1]).actions.shape == (1, 6, 2)  # type: ignore[union-attr]
 
 
+def test_observed_features_may_be_arrays_or_lists() -> None:
+    seen = {"goal": np.zeros((2, 3)), "list": [[1, 2], [3, 4]], "picture": np.zeros((2, 3, 4, 4), np.uint8)}
+    shown = Demonstrations.of(PATHS, "left", observed=seen).observed
+    kinds = {"goal": torch.float32, "list": torch.float32, "picture": torch.uint8}
+    assert {name: values.dtype for name, values in shown.items()} == kinds
+    with pytest.raises(UserError, match="observed 'goal': expected an array of numbers, found"):
+        Demonstrations.of(PATHS, "left", observed={"goal": ["here", "there"]})
+
+
 def test_actions_of_single_numbers_need_no_column(tmp_path: Path) -> None:
     numbers = [np.arange(len(path) - 1) % 2 for path in PATHS]
     acted = Demonstrations.of(PATHS, "left", actions=numbers)

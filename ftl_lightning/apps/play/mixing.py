@@ -64,7 +64,7 @@ def judge_of(model: FewShot, examples: Sequence[Demonstrations]) -> Domain:
 @functools.lru_cache(maxsize=2)
 def _outline(model: ConceptModel) -> Outline | None:
     """Judge of the parts of paths of a user's data; ``None`` for a shipped domain."""
-    return None if model.examples is None else Outline(model.examples, model.horizon)
+    return None if model.examples is None else Outline(model.examples, model.horizon, model.places)
 
 
 def _whole(model: ConceptModel, domain: Domain, plans: Demonstrations, goal: str) -> Tensor | None:

@@ -182,7 +182,7 @@ def _combined(model: Invertible, combination: Combination | None, first: Concept
 
 def _made(model: Invertible, demonstrations: Demonstrations, form: str, first: Concept, variation: float = 0.0) -> Concept:
     """Concept that samples a reference of its demonstrations, with a variation; ``first`` is composed."""
-    setting = Setting.of(demonstrations if model.examples is None else model.examples, model.horizon)
+    setting = Setting.of(demonstrations if model.examples is None else model.examples, model.horizon, model.places)
     reference = Reference.of(form, demonstrations, setting, model.horizon, (1 - variation) ** 0.5)
     return replace(first, reference=reference, variation=variation)
 

@@ -77,7 +77,7 @@ class LeftOut:
         self.rows = list(range(0, len(demonstrations), -(-len(demonstrations) // FOLDS)))
         self.others = [[row for row in range(len(demonstrations)) if row != out] for out in self.rows]
         self.frames = [None if (frames := model.frames_of(part)) is None else frames[0].cpu() for part in self.parts()]
-        self.setting = Setting.of(training, model.horizon)
+        self.setting = Setting.of(training, model.horizon, model.places)
         real = encoded(self.model, first_windows(training, model.horizon), training.initial_states)
         self.features = PathFeatures(real, self._within(training))
         known = encoded(self.model, first_windows(demonstrations, model.horizon), demonstrations.initial_states)
