@@ -1,6 +1,6 @@
 """A robot arm's new tasks from five demonstrations: ours beside behaviour cloning, fine-tuning, LoRA and shifted demonstrations.
 
-    pip install panda-gym
+    pip install '.[arm]'
     python benchmarks/experiments/arm.py --out results/arm.json
 
 The arm, its four training tasks and two new ones are those of ``examples/panda.py``. Behaviour cloning is an MLP of the present

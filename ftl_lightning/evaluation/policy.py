@@ -91,6 +91,9 @@ class Acting:
         model: model of a user's data.
         control: controller; ``None`` for none.
         sampling: sampler of the plans that are simulated.
+
+    Attributes:
+        whole, rests: whether plans are whole demonstrations, and whether these end at rest.
     """
 
     def __init__(self, model: ConceptModel, control: Control | None, sampling: Sampling) -> None:
@@ -98,6 +101,10 @@ class Acting:
         self.actions = list(action_columns(columns))
         self.states = [column for column in range(len(columns)) if column not in self.actions]
         self._control, self._ahead = control, 1
+        examples = model.examples
+        assert examples is not None
+        self.whole = int(examples.lengths.max()) <= model.horizon
+        self.rests = self.whole and _ends_at_rest(examples)
         self._inverse: Regression | None = None
         if control is not None:
             self.words = ["actions by the given controller", "from the next planned state"]
@@ -169,14 +176,11 @@ class Plans:
         self._first: dict[int, dict[str, Tensor]] = {}
         self._begun = 0
         self.followed: dict[int, list[Tensor]] = {}
-        examples = model.examples
-        assert examples is not None
-        self._whole = int(examples.lengths.max()) <= model.horizon
-        self._rests = self._whole and _ends_at_rest(examples)
 
     def __call__(self, observed: Observed, rows: list[int], step: int) -> Tensor:
         last = self._model.horizon - 1
-        begins = step - self._begun >= last and not self._rests if self._whole else step % self._execute == 0
+        whole, rests = self._acting.whole, self._acting.rests
+        begins = step - self._begun >= last and not rests if whole else step % self._execute == 0
         if step == 0 or begins:
             self._begun = step
             self._first |= {row: {name: values[index] for name, values in observed.items()} for index, row in enumerate(rows)}

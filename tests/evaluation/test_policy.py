@@ -243,6 +243,7 @@ def broken():
 """
 
 
+@pytest.mark.slow
 def test_policies_act_in_an_environment_that_the_command_line_names(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
