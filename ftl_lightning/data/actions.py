@@ -12,7 +12,9 @@ from ftl_lightning.services.randomness import generator
 ACTION = "action"
 """First word of the names of columns of actions, where they are joined to the columns of states."""
 PRESENT = "present state"
-"""Observed feature that is added to demonstrations with actions: the state from which a window begins."""
+"""Observed feature that is added to demonstrations with actions: the state from which a window begins, after the states before it
+that belong to a history.
+"""
 INITIAL = "initial state"
 """Observed feature that is added to demonstrations with actions whose plans are whole: the first state, without its actions."""
 CONTEXT = "context "

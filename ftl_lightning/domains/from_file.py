@@ -103,7 +103,9 @@ class OwnDomain(Domain):
         context = next((name for name in self.observed if name.startswith(CONTEXT) and name not in acted.observed), "")
         if context and set(context.removeprefix(CONTEXT).split(",")) <= set(acted.state_names):
             acted = with_context(acted, context)
-        acted = with_present(acted) if PRESENT in self.observed else acted
+        if PRESENT in self.observed:
+            width = acted.states.shape[2] - len(action_columns(acted.state_names))
+            acted = with_present(acted, max(self.observed[PRESENT].shape[0] // max(width, 1), 1))
         acted = with_initial(acted) if INITIAL in self.observed else acted
         fitted = super().fitted(replace(acted, domain=self.name), place)
         kinds = self.plans.kinds or (LINEAR,) * len(self.plans.columns)
@@ -201,11 +203,13 @@ def with_context(demonstrations: Demonstrations, context: str) -> Demonstrations
     return replace(demonstrations.columns(rest), observed=observed, per_step=(*demonstrations.per_step, context))
 
 
-def with_present(demonstrations: Demonstrations) -> Demonstrations:
-    """Demonstrations that observe the present state, without its actions, at every time."""
+def with_present(demonstrations: Demonstrations, history: int) -> Demonstrations:
+    """Demonstrations that observe the last ``history`` states, without their actions, at every time; the first one is repeated."""
     acts = action_columns(demonstrations.state_names)
     states = demonstrations.states[..., [column for column in range(demonstrations.states.shape[2]) if column not in acts]]
-    observed = {**demonstrations.observed, PRESENT: states.float()}
+    time = torch.arange(states.shape[1])
+    past = torch.cat([states[:, (time - back).clamp(min=0)] for back in reversed(range(history))], dim=2)
+    observed = {**demonstrations.observed, PRESENT: past.float()}
     return replace(demonstrations, observed=observed, per_step=(*demonstrations.per_step, PRESENT))
 
 
@@ -253,7 +257,12 @@ def _continuous(columns: Columns, centre: Tensor, states: Tensor) -> Tensor:
 
 
 def domain_from_file(
-    path: str, horizon: int | None, metrics: Mapping[str, float], share: float, kinds: Mapping[str, str] | None = None
+    path: str,
+    horizon: int | None,
+    metrics: Mapping[str, float],
+    share: float,
+    kinds: Mapping[str, str] | None = None,
+    history: int = 1,
 ) -> Domain:
     """Domain of a file.
 
@@ -264,6 +273,7 @@ def domain_from_file(
         metrics: see :func:`own_domain`.
         share: share of each concept's demonstrations to hold out at random, at least a single demonstration.
         kinds: kinds of columns by name, see :func:`~ftl_lightning.data.kinds.declared`.
+        history: number of states that windows of data with actions observe.
 
     Raises:
         UserError: naming the file, if it has no texts, fewer than two concepts, or a concept with a single demonstration.
@@ -293,7 +303,9 @@ def domain_from_file(
         horizon, whole = ACTED, f"--data.horizon {longest} makes them whole"
         note(f"data.horizon: actions follow the present state, so plans are windows of {horizon}; {whole}")
     if acts and horizon is not None and horizon < longest:
-        demonstrations = with_present(demonstrations)
+        demonstrations = with_present(demonstrations, history)
+    seen = "windows of demonstrations with actions, which observe states; see data.horizon"
+    require(history == 1 or PRESENT in demonstrations.observed, "data.history", f"1, or {seen}", history)
     if acts and longest <= (horizon or usual):
         demonstrations = demonstrations.at_start
         note(f"{path}: plans are whole demonstrations, which follow the places {short(', '.join(followed), 80) or 'none'}")

@@ -174,11 +174,14 @@ class Plans:
         self._model, self._concept, self._seed, self._sampling = model, concept, seed, sampling
         self._acting, self._execute = acting, execute
         self._first: dict[int, dict[str, Tensor]] = {}
+        self._past: dict[int, Tensor] = {}
         self._begun = 0
         self.followed: dict[int, list[Tensor]] = {}
 
     def __call__(self, observed: Observed, rows: list[int], step: int) -> Tensor:
         last = self._model.horizon - 1
+        if PRESENT in self._model.domain.observed:
+            observed = {**observed, PRESENT: self._history(observed[STATE], rows)}
         whole, rests = self._acting.whole, self._acting.rests
         begins = step - self._begun >= last and not rests if whole else step % self._execute == 0
         if step == 0 or begins:
@@ -192,6 +195,14 @@ class Plans:
         for row, plan in zip(rows, plans, strict=True):
             self.followed.setdefault(row, []).append(plan)
         return self._acting(present, plans, age)
+
+    def _history(self, present: Tensor, rows: list[int]) -> Tensor:
+        """The last states of each episode ``(episode, history * state)``; the first one is repeated."""
+        size = self._model.domain.observed[PRESENT].shape[0]
+        for row, state in zip(rows, present, strict=True):
+            past = self._past.get(row, state.repeat(size // len(state)))
+            self._past[row] = torch.cat((past[len(state) :], state))
+        return torch.stack([self._past[row] for row in rows])
 
     def _sampled(self, rows: list[int], present: Tensor, age: int) -> Tensor:
         """Plans ``(episode, horizon, state)`` that pass the present state at a time (``age``)."""
@@ -303,12 +314,12 @@ class Policy(Shown):
         """
         given = observation if self._observe is None else self._observe(observation)
         features = self.model.domain.observed
-        shapes = {name: feature.shape for name, feature in features.items()}
+        shapes = {name: feature.shape for name, feature in features.items() if name != PRESENT}  # made of the states
         if self._acting is None:
             require(isinstance(given, Mapping), "observation", f"a dictionary of {', '.join(features)}", type(given).__name__)
             return _by_shape({name: given.get(name) for name in features}, shapes)
         shapes[STATE] = (len(self._acting.states),)
-        starts = {*self.model.starts, PRESENT}
+        starts = {*self.model.starts}
         if isinstance(given, Mapping):
             values = {name: given[name] for name in features if name in given}
             vectors = [key for key in NAMES if key in given and key not in features]
@@ -319,7 +330,7 @@ class Policy(Shown):
             vector = _numbers("observation", given)
             values = self._of_columns(vector) or _of_vector(vector, shapes, starts)
         if STATE in values:
-            values |= {name: values[STATE] for name in (PRESENT, INITIAL) if name in features}
+            values |= {INITIAL: values[STATE]} if INITIAL in features else {}
         for name, columns in self.model.starts.items():
             if name not in values and STATE in values:
                 values[name] = _numbers("state", values[STATE])[..., [self._acting.states.index(column) for column in columns]]

@@ -242,6 +242,10 @@ class PretrainingData(pl.LightningDataModule):
     test_dataloader = val_dataloader
 
 
+MOST_HISTORY = 16
+"""Maximum number of observed states."""
+
+
 class OwnData(PretrainingData):
     """Batches of user demonstrations; the file, with a concept text per demonstration, defines the domain.
 
@@ -256,6 +260,8 @@ class OwnData(PretrainingData):
         kinds: kinds of columns by name, such as ``{heading: angle}``, see :mod:`ftl_lightning.data.kinds`; other columns have the
             kind that the file declares or the data show.
         check: whether likely faults of the demonstrations are reported before training.
+        history: number of states that plans of data with actions observe, where they are windows from the present state; more
+            than 1 where a state alone does not say how it changes, such as positions without velocities.
         validation_share: share of each concept's demonstrations to hold out, at least a single demonstration.
         seed, batch_size, steps_per_epoch, encoder, revision: see :class:`PretrainingData`; the default encoder is ``'minilm'``
             where it is installed, else ``'hashing'``.
@@ -271,6 +277,7 @@ class OwnData(PretrainingData):
         metrics: dict[str, float] | None = None,
         kinds: dict[str, str] | None = None,
         check: bool = True,
+        history: int = 1,
         validation_share: float = 0.1,
         seed: int = 0,
         batch_size: int = 128,
@@ -282,7 +289,8 @@ class OwnData(PretrainingData):
     ) -> None:
         require(0 < validation_share < 1, "data.validation_share", "a share between 0 and 1", validation_share)
         self._file, self._share, self._metrics, self._horizon = demonstrations, validation_share, dict(metrics or {}), horizon
-        self._kinds, self._check = dict(kinds or {}), check
+        check_count("data.history", history, 1, MOST_HISTORY)
+        self._kinds, self._check, self._history = dict(kinds or {}), check, history
         super().__init__(
             domain=OWN,
             seed=seed,
@@ -293,7 +301,7 @@ class OwnData(PretrainingData):
             horizon=horizon,
             start_exponent=start_exponent,
         )
-        self.save_hyperparameters()
+        self.save_hyperparameters(ignore=["history"] if history == 1 else [])
         self.metrics = self._metrics
         source = self.domain.source(None)
         assert isinstance(source, FileSource)
@@ -305,7 +313,7 @@ class OwnData(PretrainingData):
             note(f"{demonstrations}: {text}")
 
     def _domain(self, name: str) -> tuple[str, Domain]:
-        return OWN, domain_from_file(self._file, self._horizon, self._metrics, self._share, self._kinds)
+        return OWN, domain_from_file(self._file, self._horizon, self._metrics, self._share, self._kinds, self._history)
 
     def setup(self, stage: str) -> None:
         super().setup(stage)

@@ -383,6 +383,62 @@ def test_actions_of_a_discrete_space_are_rounded(quick: FewShot) -> None:
     assert set(Two.taken) == {0, 1}
 
 
+class Cart(gymnasium.Env[Any, Any]):
+    """A cart that is pushed and does not show its velocity; it is to stand at a place."""
+
+    observation_space, action_space = Box(-9, 9, (1,), np.float32), Box(-1, 1, (1,), np.float32)
+
+    def __init__(self, place: float) -> None:
+        self.place = place
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.x, self.speed, self.time = self.np_random.uniform(-1, 1), self.np_random.uniform(-0.3, 0.3), 0
+        return np.array([self.x], np.float32), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.speed += 0.1 * float(np.clip(action[0], -1, 1))
+        self.x, self.time = self.x + self.speed, self.time + 1
+        right = abs(self.x - self.place) < 0.15 and abs(self.speed) < 0.1
+        return np.array([self.x], np.float32), 0.0, False, self.time == 80, {"is_success": right}
+
+    def demonstrations(self, count: int, seed: int) -> Demonstrations:
+        rng, paths, done = np.random.default_rng(seed), [], []
+        for episode in range(count):
+            observation, path, acts = self.reset(seed=1000 * seed + episode)[0], [], []
+            for _ in range(80):
+                path.append(observation)
+                push = -1.5 * (self.x - self.place) - 4 * self.speed + rng.normal(0, 0.1)
+                acts.append(np.clip([push], -1, 1).astype(np.float32))
+                observation, *_ = self.step(acts[-1])
+            paths.append(np.array([*path, observation]))
+            done.append(np.array(acts))
+        return Demonstrations.of(paths, f"stand at {self.place}", actions=done)
+
+
+@pytest.mark.slow
+def test_a_history_shows_a_velocity_that_is_not_observed(once: Once) -> None:
+    def fit(folder: Path) -> None:
+        from ftl_lightning.data.demonstrations import concatenate
+
+        concatenate([Cart(place).demonstrations(40, 1 + row) for row, place in enumerate((-1.0, 0.0, 1.0))]).save("carts.npz")
+        options = ["--data.encoder=hashing", "--data.metrics={}", "--trainer.logger.save_dir=.", "--trainer.max_steps=800"]
+        succeed(
+            "fit",
+            f"--config={CONF / 'own.yaml'}",
+            "--data.demonstrations=carts.npz",
+            "--data.history=2",
+            "--data.horizon=16",
+            *options,
+        )
+
+    model = FewShot.from_pretrained(once("carts", fit) / "own" / "fit" / "pretrained")
+    assert model.domain.observed["present state"].shape == (2,)
+    policy = model.policy(model.learn(Cart(0.5).demonstrations(5, 60), name="stand at 0.5"))
+    episodes = model.rollout(policy, lambda: Cart(0.5), episodes=30)
+    assert episodes.success >= 0.8, episodes
+
+
 @pytest.mark.slow
 def test_pendulums_are_swung_by_windows_from_the_present_state(once: Once) -> None:
     def swings(amplitude: float, count: int, seed: int) -> Demonstrations:
