@@ -422,21 +422,15 @@ def test_a_history_shows_a_velocity_that_is_not_observed(once: Once) -> None:
         from ftl_lightning.data.demonstrations import concatenate
 
         concatenate([Cart(place).demonstrations(40, 1 + row) for row, place in enumerate((-1.0, 0.0, 1.0))]).save("carts.npz")
-        options = ["--data.encoder=hashing", "--data.metrics={}", "--trainer.logger.save_dir=.", "--trainer.max_steps=800"]
-        succeed(
-            "fit",
-            f"--config={CONF / 'own.yaml'}",
-            "--data.demonstrations=carts.npz",
-            "--data.history=2",
-            "--data.horizon=16",
-            *options,
-        )
+        options = ["--data.encoder=hashing", "--data.metrics={}", "--trainer.logger.save_dir=.", "--trainer.max_steps=1500"]
+        options += ["--data.demonstrations=carts.npz", "--data.history=2", "--data.horizon=16"]
+        succeed("fit", f"--config={CONF / 'own.yaml'}", *options)
 
     model = FewShot.from_pretrained(once("carts", fit) / "own" / "fit" / "pretrained")
     assert model.domain.observed["present state"].shape == (2,)
-    policy = model.policy(model.learn(Cart(0.5).demonstrations(5, 60), name="stand at 0.5"))
+    policy = model.policy(model.learn(Cart(0.5).demonstrations(5, 60), name="stand at 0.5"), execute=4)
     episodes = model.rollout(policy, lambda: Cart(0.5), episodes=30)
-    assert episodes.success >= 0.8, episodes
+    assert episodes.success >= 0.9, episodes
 
 
 @pytest.mark.slow
