@@ -22,6 +22,7 @@ from ftl_lightning.services.errors import UserError, require, shown
 from ftl_lightning.services.randomness import EVALUATION_SEED, generator, task_key
 from ftl_lightning.services.validation import MOST_TOGETHER, check_count, check_range
 from ftl_lightning.training.concept_model import ConceptModel
+from ftl_lightning.training.method import class_path
 from ftl_lightning.training.quality import right_plans
 
 OWN = "own demonstrations"
@@ -288,6 +289,8 @@ def generate(
         observed = joined_starts([where for task in batch if (where := starts[task]) is not None]).observed
         together = [compositions[task] for task in batch]
         plans = model.sample(together, count, generation.sampling, noise, moved(observed, model.device)).cpu()
+        expected = (len(together), count, model.horizon, len(domain.plans.columns))
+        require(plans.shape == expected, f"{class_path(type(model))}.sample", f"plans {expected}", tuple(plans.shape))
         for task, states in zip(batch, plans, strict=True):
             judged[task] = TaskResult.of(task, states, starts[task], domain, demonstrations[task])
     return [judged[task] for task in compositions]

@@ -13,6 +13,7 @@ from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.model import Draws
 from ftl_lightning.services.errors import require
 from ftl_lightning.training.concept_model import ConceptModel
+from ftl_lightning.training.method import class_path
 from ftl_lightning.training.model_config import ModelConfig
 
 if TYPE_CHECKING:  # it needs Lightning, models do not
@@ -36,7 +37,9 @@ class AdditiveModel(ConceptModel):
 
     def losses(self, states: Tensor, observed: Observed, composition: Composition, draws: Draws | None, loss: str) -> Tensor:
         runs, each = len(composition.weights), added(composition)
-        return self.errors(states, observed, each.repeat_interleave(len(states) // runs, dim=0)).unflatten(0, (runs, -1))
+        errors = self.errors(states, observed, each.repeat_interleave(len(states) // runs, dim=0))
+        require(errors.shape == (len(states),), f"{class_path(type(self))}.errors", f"errors ({len(states)},)", tuple(errors.shape))
+        return errors.unflatten(0, (runs, -1))
 
 
 def added(composition: Composition) -> Tensor:

@@ -45,6 +45,7 @@ from ftl_lightning.training.checkpoint import (
 )
 from ftl_lightning.training.concept_model import ConceptModel, joined_vectors
 from ftl_lightning.training.data import Batch, PretrainingData
+from ftl_lightning.training.method import class_path
 from ftl_lightning.training.model_config import ModelConfig, Prepared, find_view, width_of
 from ftl_lightning.training.model_folder import save_model
 
@@ -287,6 +288,7 @@ class Pretraining(pl.LightningModule, ABC, Generic[M]):
             states, observed = self.raw.perturbed(without_images.states, without_images.observed, draw)
             privileged = without_images._replace(states=states, observed=self.teaching.simulated(self.domain, observed, draw))
             losses = torch.cat((losses, self.losses(self.raw, privileged, draw)))
+        require(losses.dim() == 1, f"{class_path(type(self))}.losses", "losses (batch,)", tuple(losses.shape))
         loss = losses.mean()
         whole = mean(loss)
         if not whole.isfinite():
