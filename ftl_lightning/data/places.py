@@ -156,18 +156,29 @@ def objects(demonstrations: Demonstrations, horizon: int) -> Places:
     """
     paths, rows = first_windows(demonstrations, horizon), list(demonstrations.rows_of.values())
     width = _width(demonstrations)
+    near = _followed(paths[..., :width], rows)
     for size in range(min(width // 2, MOST_SPACE), 1, -1):
         windows = _windows(size, demonstrations.state_units, width)
         found = [
             (first, columns)
             for first in windows
             for columns in windows
-            if not set(first) & set(columns) and _beside(paths, rows, paths[:, 0, list(first)], columns) <= FOLLOWED
+            if near[list(first), list(columns)].all() and not set(first) & set(columns)
+            if _beside(paths, rows, paths[:, 0, list(first)], columns) <= FOLLOWED
         ]
         if found:
             every = [*found, *((group, group) for group in dict.fromkeys(itertools.chain(*found)))]
             return {f"{INITIAL}[{first[0]}:{first[-1] + 1}] at {columns[0]}": columns for first, columns in every}
     return {}
+
+
+def _followed(paths: Tensor, rows: list[list[int]]) -> Tensor:
+    """Whether a column alone follows the first value of another in some concept ``(first, column)``: necessary for positions."""
+    near = torch.zeros(paths.shape[2], paths.shape[2], dtype=torch.bool)
+    for some in (paths[some] for some in rows if len(some) > 2):
+        for column, first in enumerate(some[:, 0].unbind(dim=1)):
+            near[column] |= (some - first[:, None, None]).var(dim=0).amin(dim=0) <= 1.001 * FOLLOWED * first.var()
+    return near
 
 
 def _beside(paths: Tensor, rows: list[list[int]], values: Tensor, columns: tuple[int, ...]) -> float:

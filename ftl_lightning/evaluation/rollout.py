@@ -240,13 +240,15 @@ class _Record:
 
     def run(self, rows: range, steps: int, advance: Callable[..., None]) -> None:
         """Run episodes in lockstep."""
+        from gymnasium.spaces import Box, Discrete
+
         environments = {row: self._environments[row - rows.start] for row in rows}
         follow = self._policy.following(rows.stop, self._seed)
         space: Any = environments[rows.start].action_space
-        kinds = "a Box or Discrete action space"
-        require(hasattr(space, "low") or hasattr(space, "n"), "environment", kinds, shown(type(space).__name__))
-        first = getattr(space, "start", 0)  # of a Discrete space, whose actions are rounded
-        low, high = (np.full(1, first), np.full(1, first + space.n - 1)) if hasattr(space, "n") else (space.low, space.high)
+        discrete = isinstance(space, Discrete)  # whose actions are rounded
+        require(discrete or isinstance(space, Box), "environment", "a Box or Discrete action space", shown(type(space).__name__))
+        ends = (space.start, space.start + space.n - 1) if discrete else ()
+        low, high = map(np.atleast_1d, ends or (space.low, space.high))
 
         def act(active: list[int], step: int) -> list[Any]:
             each = [self._policy.observed(self._latest[row])[0] for row in active]
@@ -255,7 +257,7 @@ class _Record:
                 actions = follow(observed, active, step).numpy().astype(np.float32)
             require(actions.shape[1:] == low.shape, "act", f"actions of shape {low.shape}", actions.shape[1:])
             limited = np.where(np.isfinite(actions), actions.clip(low, high), actions)
-            if hasattr(space, "n"):
+            if discrete:
                 return [int(np.rint(value)) if np.isfinite(value) else value for value in limited[:, 0]]
             return list(limited.astype(low.dtype))
 

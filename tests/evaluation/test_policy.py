@@ -366,7 +366,7 @@ def test_a_hand_goes_to_a_thing_that_is_part_of_the_state(once: Once) -> None:
     assert episodes.success >= 0.9, episodes
 
 
-def test_actions_of_a_discrete_space_are_rounded(quick: FewShot) -> None:
+def test_actions_of_a_discrete_space_are_rounded(quick: FewShot, monkeypatch: pytest.MonkeyPatch) -> None:
     class Two(Goals):
         action_space = gymnasium.spaces.Discrete(2)  # type: ignore[assignment]
         taken: list[Any] = []  # noqa: RUF012
@@ -378,6 +378,9 @@ def test_actions_of_a_discrete_space_are_rounded(quick: FewShot) -> None:
 
     with pytest.raises(UserError, match=r"act: expected actions of shape \(1,\), found \(2,\)"):
         quick.rollout(quick.policy(quick["go to 0"]), Two, episodes=2)
+    monkeypatch.setattr(Goals, "action_space", gymnasium.spaces.MultiBinary(2))
+    with pytest.raises(UserError, match="environment: expected a Box or Discrete action space, found 'MultiBinary'"):
+        quick.rollout(quick.policy(quick["go to 0"]), Goals, episodes=2)
     one = quick.policy(quick["go to 0"], act=lambda present, following: present[:, :1])
     assert not any(quick.rollout(one, Two, episodes=2).failed)
     assert set(Two.taken) == {0, 1}
