@@ -49,7 +49,7 @@ def named_actions(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def held_actions(actions: Tensor, lengths: Tensor, time: int) -> Tensor:
-    """Actions ``(demo, time, action)`` of demonstrations with as many actions as states, or with one less; of single numbers, too.
+    """Actions ``(demo, time, action)`` of demonstrations with as many actions as states, or with one less; also of single numbers.
 
     Where the last state has none, the action before is repeated.
 

@@ -130,7 +130,7 @@ class Evaluator(pl.Callback):
     def _acted(self, module: Evaluable, judged: Sequence[TaskResult], episodes: int) -> list[TaskResult]:
         """The first ``episodes`` of each task, executed, in the domain's environment or in that of the user."""
         if self.environment is not None:
-            compositions = [one for behaviour in judged if (one := module.composition(behaviour.task)) is not None]
+            compositions = [known for behaviour in judged if (known := module.composition(behaviour.task)) is not None]
             place = Place(self.environment, self.success, episodes)
             return played(module.model, judged, compositions, place, self.generation)
         if not self.closed_loop or module.domain.closed_loop is None:

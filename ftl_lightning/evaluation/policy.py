@@ -197,7 +197,7 @@ class Plans:
         return self._acting(present, plans, age)
 
     def _history(self, present: Tensor, rows: list[int]) -> Tensor:
-        """The last states of each episode ``(episode, history * state)``; the first one is repeated."""
+        """The last states of each episode ``(episode, history * state)``; the first state is repeated."""
         size = self._model.domain.observed[PRESENT].shape[0]
         for row, state in zip(rows, present, strict=True):
             past = self._past.get(row, state.repeat(size // len(state)))
