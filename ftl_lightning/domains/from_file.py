@@ -204,7 +204,7 @@ def with_context(demonstrations: Demonstrations, context: str) -> Demonstrations
 
 
 def with_present(demonstrations: Demonstrations, history: int) -> Demonstrations:
-    """Demonstrations that observe the last ``history`` states, without their actions, at every time; the first state is repeated."""
+    """Demonstrations that observe the last ``history`` states, without their actions; the first state is repeated."""
     acts = action_columns(demonstrations.state_names)
     states = demonstrations.states[..., [column for column in range(demonstrations.states.shape[2]) if column not in acts]]
     time = torch.arange(states.shape[1])
