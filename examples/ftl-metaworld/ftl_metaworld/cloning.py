@@ -66,8 +66,8 @@ class ChunkModel(TextConceptModel):
     def plans(self, observed: Observed, composition: Composition, row: Tensor) -> Tensor:
         """Normalised plans ``(batch, horizon, state)`` of the rows ``(batch,)`` of a composition ``(row, K, ...)``."""
         network: Any = self.network
-        if composition.adapters:
-            network = adapted(self.network, composition.adapters, composition.adapter[row, 0])
+        if composition.adapter is not None:
+            network = adapted(self.network, composition.adapters, composition.adapter.amax(dim=1)[row])
         x = torch.zeros(len(row), self.config.horizon, self.config.state_dim, device=self.device)
         vector = self.vector(observed)
         assert vector is not None
@@ -99,8 +99,9 @@ class ChunkModel(TextConceptModel):
     def check_adapter(self, adapter: LowRank) -> None:
         names = dict(self.network.named_parameters())
         for name, (up, down) in adapter.factors.items():
-            size, sizes = getattr(names.get(name), "shape", ()), (len(up), down.shape[1])
-            require(bool(size) and sizes == (size[0], size.numel() // size[0]), f"key 'adapter/{name}'", f"sizes {tuple(size)}", sizes)
+            weight, sizes = names.get(name), (len(up), down.shape[1])
+            expected = None if weight is None else (len(weight), weight[0].numel())
+            require(sizes == expected, f"key 'adapter/{name}'", f"the sizes {expected}", sizes)
 
 
 class ChunkPretraining(Pretraining[ChunkModel]):
@@ -119,8 +120,7 @@ class ChunkPretraining(Pretraining[ChunkModel]):
         return ChunkModel(prepared.configured(ChunkConfig, network=dict(self.hparams["network"] or {})))
 
     def losses(self, model: ChunkModel, batch: Batch, draw: torch.Generator) -> Tensor:
-        composition = Composition(model.training_embeddings[:, None, None], torch.ones(len(model.training_embeddings), 1, device=self.device))
-        errors = model.plans(batch.observed, composition, batch.concepts) - model.encode(batch.states, batch.observed)
+        errors = model.plans(batch.observed, model.compositions(), batch.concepts) - model.encode(batch.states, batch.observed)
         return errors.square().mean(dim=(1, 2))
 
 
@@ -172,8 +172,8 @@ class FromScratch(Adaptation):
                 optimizer.step(gradient, step, steps)
             loss = mean.item()
         before = dict(self.model.network.named_parameters())
-        changes = {key: (parameter.detach() - before[key]).flatten(min(1, parameter.dim() - 1)) for key, parameter in network.named_parameters()}
-        changes = {key: change[:, None] if change.dim() == 1 else change for key, change in changes.items()}
+        after = {key: parameter.detach() for key, parameter in network.named_parameters()}
+        changes = {key: (weight - before[key]).reshape(len(weight), -1) for key, weight in after.items()}
         adapter = LowRank({key: (change, torch.eye(change.shape[1])) for key, change in changes.items()}, everywhere=True)
         origin = self.model.origin(self.demonstrations, name, "fixed", loss)
         return Concept(alone.embeddings[0], alone.weights[0], origin, adapter=adapter)

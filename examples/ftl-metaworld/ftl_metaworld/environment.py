@@ -3,7 +3,7 @@
 import copy
 import functools
 import warnings
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import gymnasium
 import numpy as np
@@ -22,8 +22,8 @@ RANDOM = 6
 """Maximum size of the vector that Meta-World draws for an episode: places of objects and of the goal."""
 SCENE = 1 + RANDOM
 HAND, GRIPPER, FIRST, SECOND, GOAL = slice(0, 3), slice(3, 4), slice(4, 11), slice(11, 18), slice(18, 21)
-"""Columns of the observed world: the hand's place, the opening of the gripper (0 to 1), place and quaternion of the first and of the
-second object (0 where there is none), and the goal."""
+"""Columns of the observed world: place of the hand, opening of the gripper (0 to 1), place and quaternion of the first and of the
+second object (0 without an object), place of the goal."""
 WORLD = 21
 COLUMNS, UNITS = ("dx", "dy", "dz", "gripper"), ("cm", "cm", "cm", "")
 """Columns of an action."""
@@ -76,7 +76,7 @@ class MetaWorld(gymnasium.Env[Any, Any]):
     """
 
     def __init__(self) -> None:
-        self.name, self._simulator = "", None
+        self.name, self._simulator = "", cast("Any", None)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         scene = np.asarray((options or {})["scene"], dtype=np.float64)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -39,7 +39,7 @@ VERSION = 1
 
 @dataclass(frozen=True)
 class Episode:
-    """An expert's episode: worlds ``(time, 21)``, the expert's actions ``(time, 4)`` before each, and whether it ends with success."""
+    """Episode of an expert: worlds ``(time, 21)``, the action ``(time, 4)`` before each world, and success."""
 
     worlds: NDArray[np.float32]
     actions: NDArray[np.float32]
@@ -51,7 +51,7 @@ def expert(name: str) -> Any:
     """Meta-World's scripted policy of a task."""
     from metaworld.policies import ENV_POLICY_MAP
 
-    return ENV_POLICY_MAP[f"{name}-v3"]()
+    return cast("Any", ENV_POLICY_MAP[f"{name}-v3"])()
 
 
 def act(env: MetaWorld) -> NDArray[np.float32]:
@@ -132,7 +132,7 @@ class Experts:
         self.training, self.domain = training, domain
 
     def split(self, name: Split, count: int, seed: int) -> Demonstrations:
-        """``count`` demonstrations of every training task; those not in the cache are made in as many processes as there are cores."""
+        """``count`` demonstrations of every training task; missing ones are made in a process per core."""
         start, made = seed if name == "train" else VALIDATION_SEED + seed, []
         with (
             ExitStack() as stack,

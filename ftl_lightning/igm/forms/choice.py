@@ -34,7 +34,7 @@ from ftl_lightning.igm.settings import (
 from ftl_lightning.services.errors import UserError
 
 RANK, RATE, ADAPTER_STEPS = 1, 3e-3, 120
-"""Default rank, learning rate and steps of adapters."""
+"""Rank, learning rate and maximum number of steps of adapters, if the settings give no rank."""
 SKILLED: Mapping[str, Any] = {"adapter": 8, "adapter_learning_rate": 6e-3, "components": 1, "omega": 1.0, "samples": 16}
 SKILLED_STEPS = 200
 """Settings and steps of the adapter that :func:`by_skill` learns."""
@@ -149,7 +149,8 @@ def _adapted(
     adapter = settings.adapter
     rank, rate = (adapter.rank, adapter.learning_rate) if adapter.rank else (RANK, RATE)
     changes = {"modes": "each" if mixed else 1, "adapter": rank, "adapter_learning_rate": rate, "tolerance": None}
-    one, most = settings.from_one_start(form=PAPER, **changes), SKILLED_STEPS if by_sample else ADAPTER_STEPS
+    one = settings.from_one_start(form=PAPER, **changes)
+    most = SKILLED_STEPS if by_sample else steps if adapter.rank else ADAPTER_STEPS
     start = Inversion(model, demonstrations, one, by_sample).to(model.device)
     concepts = invert(model, demonstrations, one, min(steps, most), tell, start=start)
     for name, concept in concepts.items():
