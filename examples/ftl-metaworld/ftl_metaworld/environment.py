@@ -70,9 +70,9 @@ def make(name: str) -> Any:
 class MetaWorld(gymnasium.Env[Any, Any]):
     """An episode of any task.
 
-    A scene ``(7,)`` is the number of the task in :data:`.tasks.NAMES` and the vector that Meta-World draws for an episode. An action
-    ``(4,)`` moves the commanded place of the hand by as many centimetres, at most 1 each way, and sets the gripper's effort, -1
-    (open) to 1 (closed). ``info['success']`` is Meta-World's; an episode ends with it.
+    A scene ``(7,)`` holds the number of the task in :data:`.tasks.NAMES` and the vector that Meta-World draws for an episode. An
+    action ``(4,)`` moves the commanded place of the hand, by at most 1 cm along each axis, and sets the effort of the gripper, -1
+    (open) to 1 (closed). An episode ends with success as Meta-World defines it, ``info['success']``.
     """
 
     def __init__(self) -> None:

@@ -1,0 +1,140 @@
+"""Write the tables of the page on Meta-World from the rows of its ablations: ``results/metaworld.md`` and ``metaworld_*.md``.
+
+    python table.py
+
+Success in closed loop of every method on the test tasks of ML10 and ML45, on training tasks, and on ML45's training tasks left out
+in turn; each task; paired tests of ours against every method; the settings that were tried.
+"""
+
+import argparse
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import pandas as pd
+from ftl_metaworld.tasks import NAMES, NUMBER
+
+from ftl_lightning.reporting.paired import holm, sign_flip
+
+RESULTS = Path(__file__).resolve().parents[2] / "results"
+SUCCESS = "closed loop success"
+METHODS: Mapping[str, tuple[str, str]] = {
+    "**FTL-IGM, form chosen**": ("FTL-IGM", "form chosen"),
+    "FTL-IGM, the paper's form": ("FTL-IGM", ""),
+    "LoRA fine-tuning of our model": ("LoRA fine-tuning", ""),
+    "full fine-tuning of our model": ("full fine-tuning", ""),
+    "BC, same network, full fine-tuning": ("BC, same network, full fine-tuning", ""),
+    "BC, same network, LoRA": ("BC, same network, LoRA fine-tuning", ""),
+    "BC, same network, concept alone": ("BC, same network", ""),
+    "BC from scratch": ("BC from scratch", ""),
+    "in-context": ("in-context", ""),
+    "language": ("language", ""),
+    "*shifted demonstration, not learned*": ("shifted demonstration", ""),
+    "*expert, scripted*": ("expert (oracle)", ""),
+}
+"""Method and form of the rows, by name in the tables; references in italics."""
+OURS = "**FTL-IGM, form chosen**"
+
+
+def number(value: float) -> str:
+    """Two digits, without the zero before the point."""
+    return f"{value:.2f}".removeprefix("0") if value < 1 else f"{value:.2f}"
+
+
+def table(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
+    """Table in Markdown."""
+    return "\n".join(f"| {' | '.join(line)} |" for line in (head, ["---"] * len(head), *lines)) + "\n"
+
+
+def of(rows: pd.DataFrame, name: str) -> pd.DataFrame:
+    """Rows of a method by its name in the tables."""
+    method, form = METHODS[name]
+    return rows[(rows["method"] == method) & (rows["form"] == form)]
+
+
+def cell(rows: pd.DataFrame) -> str:
+    """Mean ± standard error over tasks, and in brackets the standard deviation of the mean over seeds; a dash without rows."""
+    if rows.empty:
+        return "-"
+    tasks = rows.groupby("task")["value"].mean().to_numpy()
+    text = number(tasks.mean()) + (f" ± {number(tasks.std(ddof=1) / len(tasks) ** 0.5)}" if len(tasks) > 1 else "")
+    seeds = rows.groupby("seed")["value"].mean().to_numpy()
+    return text + (f" ({number(seeds.std())})" if len(seeds) > 1 else "")
+
+
+def summary(rows: pd.DataFrame) -> str:
+    """Every method in every setting."""
+    groups = {
+        "ML10, test": (["ml10"], "new concept"),
+        "ML45, test": (["ml45"], "new concept"),
+        "ML45, left out in turn": ([f"ml45-{fold}" for fold in range(1, 10)], "new concept"),
+        "ML10, training": (["ml10"], "training concept"),
+        "ML45, training": (["ml45"], "training concept"),
+    }
+    parts = {name: rows[rows["domain"].isin(domains) & (rows["setting"] == setting)] for name, (domains, setting) in groups.items()}
+    parts = {name: part for name, part in parts.items() if len(part)}
+    head = ["success", *(f"{name} ({part['task'].nunique()} tasks)" for name, part in parts.items())]
+    return table(head, [[name, *(cell(of(part, name)) for part in parts.values())] for name in METHODS])
+
+
+def each(rows: pd.DataFrame, domain: str) -> str:
+    """Every method on each test task."""
+    part = rows[(rows["domain"] == domain) & (rows["setting"] == "new concept")]
+    tasks = list(dict.fromkeys(part["task"]))
+    names = [NAMES[NUMBER[task]] for task in tasks]
+    lines = [[name, *(cell(found[found["task"] == task]) for task in tasks)] for name in METHODS if len(found := of(part, name))]
+    return table([f"success, {domain.upper()}", *names], lines)
+
+
+def paired(rows: pd.DataFrame) -> str:
+    """Ours against every method: two-sided sign-flip tests over the test tasks and those left out in turn."""
+    part = rows[rows["setting"] == "new concept"]
+    ours = of(part, OURS).groupby(["domain", "task"])["value"].mean()
+    lines, values = [], []
+    for name in METHODS:
+        other = of(part, name).groupby(["domain", "task"])["value"].mean()
+        both = ours.index.intersection(other.index)
+        if name == OURS or both.empty:
+            continue
+        apart = ours[both] - other[both]
+        values.append(sign_flip((apart / len(apart)).tolist()))
+        better, worse = int((apart > 1e-6).sum()), int((apart < -1e-6).sum())
+        lines.append([name, f"{apart.mean():+.2f}", f"{better} / {len(apart) - better - worse} / {worse}"])
+    lines = [[*line, f"{p:.3f}"] for line, p in zip(lines, holm(values), strict=True)]
+    return table(["ours against", "difference", "tasks ahead / equal / behind", "p (Holm)"], lines)
+
+
+def tuning(rows: pd.DataFrame) -> str:
+    """Settings of every method on the validation tasks."""
+    rows = rows.assign(called=[f"{method} {form}".strip() for method, form in zip(rows["method"], rows["form"], strict=True)])
+    lines = [
+        [str(called), f"{variant}, omega {omega}", number(float(part["value"].mean()))]
+        for (called, variant, omega, _), part in rows.groupby(["called", "variant", "omega", "config_hash"], sort=False)
+    ]
+    return table(["method", "setting", "success on the six validation tasks"], lines)
+
+
+def read(path: Path) -> pd.DataFrame:
+    """Rows of success; none without a file."""
+    if not path.is_file():
+        return pd.DataFrame()
+    rows = pd.read_csv(path, dtype={"omega": str}, keep_default_na=False, na_values={"value": [""]})
+    return rows[rows["metric"] == SUCCESS]
+
+
+def main() -> None:
+    """Write all tables whose rows exist."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--results", type=Path, default=RESULTS, help="folder of the rows and tables")
+    folder: Path = parser.parse_args().results
+    rows = pd.concat([read(folder / "metaworld.csv"), read(folder / "metaworld_folds.csv")])
+    made = {"metaworld": summary(rows), "metaworld_paired": paired(rows)}
+    made |= {f"metaworld_{domain}": each(rows, domain) for domain in ("ml10", "ml45") if domain in set(rows["domain"])}
+    if len(tried := read(folder / "metaworld_tuning.csv")):
+        made["metaworld_tuning"] = tuning(tried)
+    for name, text in made.items():
+        (folder / f"{name}.md").write_text(text, "utf-8")
+        print(f"{name}.md\n\n{text}")
+
+
+if __name__ == "__main__":
+    main()
