@@ -117,6 +117,7 @@ def domain(name: str, training: tuple[str, ...], new: tuple[str, ...]) -> Domain
             steps=MAX_STEPS,
             judge=judge,
             film=deferred("ftl_metaworld.rendering:film"),
+            vector_film=deferred("ftl_metaworld.rendering:vector_film"),
             policies={"expert (oracle)": expert, "shifted demonstration": shifted},
         ),
         comparison=Comparison(headline=EXECUTED, fresh=False),

@@ -15,6 +15,7 @@ from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.execution import Rollout
 from ftl_lightning.domains.films import FINER, PAPER, SIZE, Frames, Points, Shape, VectorFilm, some, still
 from ftl_lightning.domains.pictures import framed
+from ftl_lightning.services.errors import note
 from ftl_metaworld.domain import act
 from ftl_metaworld.environment import FIRST, GOAL, GRIPPER, HAND, SECOND, STEP, MetaWorld
 
@@ -163,6 +164,7 @@ def _renderer(model: "mujoco.MjModel") -> "mujoco.Renderer | None":
         try:
             return Renderer(model, SIZE, SIZE)
         except Exception:  # each OpenGL library raises its own
+            note("film: MuJoCo finds no OpenGL, so films are drawings; for pictures set the variable MUJOCO_GL to egl or osmesa")
             return None
 
 
