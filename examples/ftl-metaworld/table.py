@@ -127,7 +127,9 @@ def main() -> None:
     parser.add_argument("--results", type=Path, default=RESULTS, help="folder of the rows and tables")
     folder: Path = parser.parse_args().results
     rows = pd.concat([read(folder / "metaworld.csv"), read(folder / "metaworld_folds.csv")])
+    published = pd.read_csv(Path(__file__).parent / "published.csv", dtype=str, keep_default_na=False)
     made = {"metaworld": summary(rows), "metaworld_paired": paired(rows)}
+    made["metaworld_published"] = table(list(map(str, published)), published.to_numpy().tolist())
     made |= {f"metaworld_{domain}": each(rows, domain) for domain in ("ml10", "ml45") if domain in set(rows["domain"])}
     if len(tried := read(folder / "metaworld_tuning.csv")):
         made["metaworld_tuning"] = tuning(tried)
