@@ -7,6 +7,7 @@ in turn; each task; paired tests of ours against every method; the settings that
 """
 
 import argparse
+import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -113,6 +114,33 @@ def tuning(rows: pd.DataFrame) -> str:
     return table(["method", "setting", "success on the six validation tasks"], lines)
 
 
+def forgotten(rates: Mapping[str, Sequence[float]]) -> str:
+    """Mean success on the training tasks after a test task was learned."""
+    lines = [[method, number(sum(values) / len(values)), str(len(values))] for method, values in rates.items()]
+    return table(["learned by", "success on training tasks", "pairs of test task and training task"], lines)
+
+
+def experts(rates: Mapping[str, Mapping[str, float]]) -> str:
+    """Mean success of the experts, and the tasks that they do not solve."""
+    lines = []
+    for key in ("observed", "hidden"):
+        failed = [name for name, each in rates.items() if each[key] < 0.5]
+        lines.append([key, number(sum(each[key] for each in rates.values()) / len(rates)), ", ".join(failed) or "none"])
+    return table(["goal", "success, mean of 50 tasks", "tasks with success below one half"], lines)
+
+
+def composed(rows: pd.DataFrame) -> str:
+    """Tasks behind a wall by a composition, by the task without a wall, and by their own training concept."""
+    ours = rows[(rows["domain"] == "ml45") & (rows["method"] == "FTL-IGM") & (rows["form"] == "form chosen")]
+    named = {"composition": "both concepts", "one of both": "without the way past a wall", "training concept": "its own concept"}
+    goals = list(dict.fromkeys(ours[ours["setting"] == "composition"]["task"]))
+    lines = [
+        [NAMES[NUMBER[goal]], *(cell(ours[(ours["task"] == goal) & (ours["setting"] == setting)]) for setting in named)]
+        for goal in goals
+    ]
+    return table(["success", *named.values()], lines)
+
+
 def read(path: Path) -> pd.DataFrame:
     """Rows of success; none without a file."""
     if not path.is_file():
@@ -131,6 +159,11 @@ def main() -> None:
     made = {"metaworld": summary(rows), "metaworld_paired": paired(rows)}
     made["metaworld_published"] = table(list(map(str, published)), published.to_numpy().tolist())
     made |= {f"metaworld_{domain}": each(rows, domain) for domain in ("ml10", "ml45") if domain in set(rows["domain"])}
+    if "composition" in set(rows["setting"]):
+        made["metaworld_composition"] = composed(rows)
+    for name, write in (("forgetting", forgotten), ("experts", experts)):
+        if (path := folder / f"metaworld_{name}.json").is_file():
+            made[f"metaworld_{name}"] = write(json.loads(path.read_text("utf-8")))
     if len(tried := read(folder / "metaworld_tuning.csv")):
         made["metaworld_tuning"] = tuning(tried)
     for name, text in made.items():

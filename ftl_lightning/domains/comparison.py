@@ -11,8 +11,8 @@ from torch import Tensor
 from ftl_lightning.data.distances import Distance
 from ftl_lightning.data.features import InitialStates
 
-OURS, FINE_TUNED, FULLY_TUNED = "FTL-IGM", "LoRA fine-tuning", "full fine-tuning"
-"""Names of the paper's method, and of baselines that adapt the whole network to a concept, by an adapter of low or full rank."""
+OURS, FINE_TUNED = "FTL-IGM", "LoRA fine-tuning"
+"""Names of the paper's method, and of the baseline that learns a concept with an adapter of the whole network."""
 WITH_MODES, WITH_KNOTS, WITH_ADAPTER, CHOSEN = "with modes", "over time", "with adapter", "form chosen"
 FORMS = (WITH_MODES, WITH_KNOTS, WITH_ADAPTER, CHOSEN)
 """Forms of a method beyond the paper, in the order in which their names are joined, as in ``'with modes over time'``."""

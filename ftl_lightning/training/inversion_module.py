@@ -6,7 +6,7 @@ from typing import Literal
 
 import torch
 
-from ftl_lightning.domains.comparison import CHOSEN, FINE_TUNED, FULLY_TUNED, OURS, WITH_ADAPTER, WITH_MODES
+from ftl_lightning.domains.comparison import CHOSEN, FINE_TUNED, OURS, WITH_ADAPTER, WITH_MODES
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.igm.forms.choice import first_settings
@@ -87,8 +87,7 @@ class InversionModule(Adaptation):
         """Labels of the settings, whose form is selected for a user's demonstrations."""
         settings, method, decided = self.settings, self.model.method, FORMS.get(self.settings.form)
         embeddings, weights, adapter = settings.embeddings, settings.weights, settings.adapter
-        full = adapter.rank >= max(map(min, self.model.adaptable().values()), default=0)
-        fine_tuned = (FULLY_TUNED if full else FINE_TUNED) if adapter.rank and adapter.scope == "all" else ""
+        fine_tuned = adapter.rank > 0 and adapter.scope == "all"
         form = method.form({**self.hparams, **({"modes": 1, "adapter": 0} if decided else {})})
         span = {1.0: "free", 0.0: "span"}.get(embeddings.off_span, f"near span {embeddings.off_span:g}")
         sets = 1 if decided else settings.modes.sets
@@ -100,7 +99,7 @@ class InversionModule(Adaptation):
             f"training weight {weights.training or 0:g}": weights.training is not None,
         }
         return Labels(
-            method.name if not fine_tuned else fine_tuned if method.name == OURS else f"{method.name}, {fine_tuned}",
+            method.name if not fine_tuned else FINE_TUNED if method.name == OURS else f"{method.name}, {FINE_TUNED}",
             "" if fine_tuned else " ".join(word for word in (form, decided) if word),
             ", ".join([*self.model.traits, span, *(text for text, applies in parts.items() if applies)]),
         )

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from ftl_lightning.data.features import Observed
+from ftl_lightning.domains.comparison import OURS
 from ftl_lightning.igm.composition import Composition, batched
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.igm.diffusion import Context
@@ -20,6 +21,7 @@ from ftl_lightning.igm.model import Draws
 from ftl_lightning.igm.optimizer import Adam
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.methods.bases import added
+from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.networks import MLPDenoiser
 from ftl_lightning.services.errors import require
 from ftl_lightning.services.randomness import generator, task_key
@@ -124,56 +126,78 @@ class ChunkPretraining(Pretraining[ChunkModel]):
         return errors.square().mean(dim=(1, 2))
 
 
-class FromScratch(Adaptation):
-    """Learns all weights of the network from a concept's demonstrations alone, from random initial weights.
+class AllWeights(Adaptation):
+    """Learns all weights of the network, and the concept's embedding, from a concept's demonstrations.
+
+    Of our model the encoder of the observation stays as it is, and so do biases: an adapter changes neither.
 
     Args:
-        pretrained: folder of a pretrained model, of which only architecture and normalisation are used.
-        learning_rate: learning rate of Adam, which decays to 0 by a cosine.
+        pretrained: folder of a pretrained model.
+        scratch: whether to begin with random weights; normalisation is the pretrained model's.
+        learning_rate, embedding_learning_rate: rates of Adam, which decay to 0 by a cosine; the embedding starts at the mean of the
+            training concepts.
         samples: windows of a gradient step.
+        loss: quantity of a diffusion model's squared error.
         output: folder for the concepts; ``None`` for ``concepts`` in the log folder.
         seed: seed of weights, windows and the evaluation's rows.
     """
 
     learns = True
-    labels = Labels("BC from scratch")
 
     def __init__(
-        self, pretrained: str, learning_rate: float = 1e-3, samples: int = 256, output: str | None = None, seed: int = 0
+        self,
+        pretrained: str,
+        scratch: bool = False,
+        learning_rate: float = 1e-3,
+        embedding_learning_rate: float = 0.1,
+        samples: int = 64,
+        loss: str = "clean",
+        output: str | None = None,
+        seed: int = 0,
     ) -> None:
         super().__init__(pretrained, 1.0, output)
         self.save_hyperparameters()
 
+    @property
+    def labels(self) -> Labels:
+        name = "full fine-tuning" if self.model.method.name == OURS else f"{self.model.method.name}, full fine-tuning"
+        return Labels("BC from scratch" if self.hparams["scratch"] else name, variant=f"rate {self.hparams['learning_rate']:g}")
+
     @classmethod
     def adapts(cls, model: type[ConceptModel]) -> bool:
-        return issubclass(model, ChunkModel)
+        return issubclass(model, ChunkModel | GenerativeModel)
 
     def learn(self) -> dict[str, Concept]:
         return {name: self._learn(name) for name in self.concepts}
 
     def _learn(self, name: str) -> Concept:
-        assert isinstance(self.model, ChunkModel)
-        steps, seed = int(self.trainer.datamodule.hparams["steps"]), self.hparams["seed"]  # type: ignore[attr-defined]
+        options, steps = self.hparams, int(self.trainer.datamodule.hparams["steps"])  # type: ignore[attr-defined]
         shown, model = self.demonstrations.select(name), copy.copy(self.model)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
-            network = Regressor(self.model.config)
-        model._modules = {**self.model._modules, "network": network.requires_grad_(True)}
-        optimizers = [Adam(parameter, self.hparams["learning_rate"]) for parameter in network.parameters()]
-        alone = Composition(torch.zeros(1, 1, 1, self.model.config.concept_dim), torch.ones(1, 1))
-        loss = 0.0
+        key = "network" if isinstance(model, ChunkModel) else "denoiser"
+        before, network = self.model.get_submodule(key), copy.deepcopy(self.model.get_submodule(key)).requires_grad_(True)
+        if options["scratch"] and isinstance(model, ChunkModel):
+            with torch.random.fork_rng(devices=[]):
+                torch.manual_seed(options["seed"])
+                network = Regressor(model.config)
+        model._modules = {**self.model._modules, key: network}  # a model of its own, which shares all else
+        every = isinstance(model, ChunkModel)
+        weights = {
+            key: weight for key, weight in network.named_parameters() if every or (weight.dim() > 1 and "initial" not in key)
+        }
+        embedding = nn.Parameter(torch.zeros(1, 1, 1, model.config.concept_dim))  # the mean of the training concepts
+        rates = {embedding: options["embedding_learning_rate"]} | dict.fromkeys(weights.values(), options["learning_rate"])
+        optimizers, loss = [Adam(parameter, rate) for parameter, rate in rates.items()], 0.0
         for step in range(steps):
-            draw = generator("cpu", seed, step, task_key(name))
-            rows = torch.randint(len(shown), (self.hparams["samples"],), generator=draw)
+            draw = generator("cpu", options["seed"], step, task_key(name))
+            rows = torch.randint(len(shown), (options["samples"],), generator=draw)
             states, observed = model.windows(shown, rows, torch.rand(len(rows), generator=draw), draw)
-            mean = model.losses(states, observed, alone, None, "").mean()
-            gradients = torch.autograd.grad(mean, [optimizer.parameter for optimizer in optimizers], materialize_grads=True)
-            for optimizer, gradient in zip(optimizers, gradients, strict=True):
+            composition = Composition(embedding, torch.ones(1, 1))
+            mean = model.losses(states, observed, composition, model.draws(len(rows), 1.0, draw), options["loss"]).mean()
+            for optimizer, gradient in zip(optimizers, torch.autograd.grad(mean, list(rates), materialize_grads=True), strict=True):
                 optimizer.step(gradient, step, steps)
             loss = mean.item()
-        before = dict(self.model.network.named_parameters())
-        after = {key: parameter.detach() for key, parameter in network.named_parameters()}
-        changes = {key: (weight - before[key]).reshape(len(weight), -1) for key, weight in after.items()}
+        old = dict(before.named_parameters())
+        changes = {key: (weight.detach() - old[key]).reshape(len(weight), -1) for key, weight in weights.items()}
         adapter = LowRank({key: (change, torch.eye(change.shape[1])) for key, change in changes.items()}, everywhere=True)
         origin = self.model.origin(self.demonstrations, name, "fixed", loss)
-        return Concept(alone.embeddings[0], alone.weights[0], origin, adapter=adapter)
+        return Concept(embedding.detach()[0], torch.ones(1), origin, adapter=adapter)

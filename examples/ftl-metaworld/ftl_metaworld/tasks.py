@@ -21,6 +21,15 @@ VALIDATION = ("button-press", "faucet-open", "handle-pull", "plate-slide", "peg-
 """Tasks for tuning: training tasks of ML45 outside ML10."""
 
 
+DETOURS = {
+    "reach-wall": ("reach", "pick-place-wall"),
+    "push-wall": ("push", "reach-wall"),
+    "button-press-wall": ("button-press", "reach-wall"),
+    "button-press-topdown-wall": ("button-press-topdown", "reach-wall"),
+}
+"""Tasks behind a wall, with two training concepts that describe them together: the task without a wall, and a way past a wall."""
+
+
 def texts(**columns: Collection[str]) -> tuple[str, ...]:
     """Concepts of the tasks whose columns have one of the values, in the file's order."""
     return tuple(row["text"] for row in ROWS if all(row[key] in values for key, values in columns.items()))
@@ -32,10 +41,14 @@ def learned(setting: str, concepts: tuple[str, ...]) -> Suite:
 
 
 def suites(training: tuple[str, ...], new: tuple[str, ...]) -> dict[str, Suite]:
-    """``training``; ``new`` and ``paper``, the test tasks; ``validation``, of the tasks in neither; and ``after``.
-
-    ``after`` judges training tasks while a new concept is learned: what fine-tuning forgets.
-    """
+    """Suites: ``training``; ``paper``, the test tasks; ``validation``, tasks in neither; ``composition``, of :data:`DETOURS`."""
     validation = tuple(text for text in (TEXTS[name] for name in VALIDATION) if text not in (*training, *new))
     made = {"training": training_suite(training), "paper": learned("new concept", new)}
-    return made | ({"validation": learned("new concept", validation)} if validation else {})
+    made |= {"validation": learned("new concept", validation)} if validation else {}
+    named = {TEXTS[name]: tuple(TEXTS[part] for part in parts) for name, parts in DETOURS.items()}
+    if set(training) >= {text for goal, parts in named.items() for text in (goal, *parts)}:
+        tasks = [EvaluationTask("composition", goal, texts=parts) for goal, parts in named.items()]
+        made["composition"] = Suite(
+            (*tasks, *(EvaluationTask("one of both", goal, texts=parts[:1]) for goal, parts in named.items()))
+        )
+    return made
