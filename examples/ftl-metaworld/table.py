@@ -144,7 +144,7 @@ def composed(rows: pd.DataFrame) -> str:
 def read(path: Path) -> pd.DataFrame:
     """Rows of success; none without a file."""
     if not path.is_file():
-        return pd.DataFrame()
+        return pd.DataFrame(columns=["domain", "setting", "task", "method", "form", "variant", "omega", "seed", "value"])
     rows = pd.read_csv(path, dtype={"omega": str}, keep_default_na=False, na_values={"value": [""]})
     return rows[rows["metric"] == SUCCESS]
 
