@@ -1,4 +1,4 @@
-"""Processor time of one core for demonstrations, pretraining, learning and acting: ``results/metaworld_cost.json``.
+"""Processor time of one core for demonstrations, pretraining, learning and acting: ``results/cost.json``.
 
 python cost.py
 """
@@ -19,7 +19,7 @@ from ftl_lightning import FewShot
 from ftl_lightning.cli.main import main as run
 from ftl_lightning.domains.registry import load_domain
 
-OUT = Path(__file__).resolve().parents[2] / "results" / "metaworld_cost.json"
+OUT = Path(__file__).resolve().parent / "results" / "cost.json"
 SHOWN, STEPS = 5, 500
 """Demonstrations of a task and steps of pretraining that are measured."""
 

@@ -1,4 +1,4 @@
-"""Success of Meta-World's scripted experts with the goal observed and hidden: ``results/metaworld_experts.json``.
+"""Success of Meta-World's scripted experts with the goal observed and hidden: ``results/experts.json``.
 
     python experts.py
 
@@ -15,7 +15,7 @@ from ftl_metaworld.environment import MetaWorld
 from ftl_metaworld.source import act, scenes
 from ftl_metaworld.tasks import TEXTS
 
-OUT = Path(__file__).resolve().parents[2] / "results" / "metaworld_experts.json"
+OUT = Path(__file__).resolve().parent / "results" / "experts.json"
 EPISODES, SEED = 20, 4_000_000
 
 

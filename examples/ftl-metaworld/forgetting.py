@@ -1,4 +1,4 @@
-"""Success on ML10's training tasks after a test task was learned: ``results/metaworld_forgetting.json``.
+"""Success on ML10's training tasks after a test task was learned: ``results/forgetting.json``.
 
     python forgetting.py
 
@@ -16,7 +16,7 @@ import torch
 from ftl_lightning import FewShot
 from ftl_lightning.services.randomness import DEMONSTRATION_SEED
 
-OUT = Path(__file__).resolve().parents[2] / "results" / "metaworld_forgetting.json"
+OUT = Path(__file__).resolve().parent / "results" / "forgetting.json"
 EPISODES = 10
 OURS, BC = "pretrained/ml10", "logs/table/bc-ml10/pretrained"
 METHODS: dict[str, tuple[str, str, dict[str, Any] | None]] = {

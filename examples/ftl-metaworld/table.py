@@ -1,4 +1,4 @@
-"""Write the tables of the page on Meta-World from the rows of its ablations: ``results/metaworld.md`` and ``metaworld_*.md``.
+"""Write the tables of the page on Meta-World from the rows of its ablations: ``results/*.md``.
 
     python table.py
 
@@ -16,7 +16,7 @@ from ftl_metaworld.tasks import NAMES, NUMBER
 
 from ftl_lightning.reporting.paired import holm, sign_flip
 
-RESULTS = Path(__file__).resolve().parents[2] / "results"
+RESULTS = Path(__file__).resolve().parent / "results"
 SUCCESS = "closed loop success"
 METHODS: Mapping[str, tuple[str, str]] = {
     "**FTL-IGM, form chosen**": ("FTL-IGM", "form chosen"),
@@ -154,20 +154,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--results", type=Path, default=RESULTS, help="folder of the rows and tables")
     folder: Path = parser.parse_args().results
-    rows = pd.concat([read(folder / "metaworld.csv"), read(folder / "metaworld_folds.csv")])
+    rows = pd.concat([read(folder / "table.csv"), read(folder / "folds.csv")])
     published = pd.read_csv(Path(__file__).parent / "published.csv", dtype=str, keep_default_na=False)
-    made = {"metaworld": summary(rows), "metaworld_paired": paired(rows)}
-    made["metaworld_published"] = table(list(map(str, published)), published.to_numpy().tolist())
-    made |= {f"metaworld_{domain}": each(rows, domain) for domain in ("ml10", "ml45") if domain in set(rows["domain"])}
+    made = {"summary": summary(rows), "paired": paired(rows)}
+    made["published"] = table(list(map(str, published)), published.to_numpy().tolist())
+    made |= {f"{domain}": each(rows, domain) for domain in ("ml10", "ml45") if domain in set(rows["domain"])}
     if "composition" in set(rows["setting"]):
-        made["metaworld_composition"] = composed(rows)
+        made["composition"] = composed(rows)
     for name, write in (("forgetting", forgotten), ("experts", experts)):
-        if (path := folder / f"metaworld_{name}.json").is_file():
-            made[f"metaworld_{name}"] = write(json.loads(path.read_text("utf-8")))
-    if len(tried := read(folder / "metaworld_tuning.csv")):
-        made["metaworld_tuning"] = tuning(tried)
+        if (path := folder / f"{name}.json").is_file():
+            made[f"{name}"] = write(json.loads(path.read_text("utf-8")))
+    if len(tried := read(folder / "tuning.csv")):
+        made["tuning"] = tuning(tried)
     for name, text in made.items():
         (folder / f"{name}.md").write_text(text, "utf-8")
+    for name, text in made.items():
         print(f"{name}.md\n\n{text}")
 
 
