@@ -1,6 +1,6 @@
 """Processor time of one core for demonstrations, pretraining, learning and acting: ``results/cost.json``.
 
-python cost.py
+python processor_time.py
 """
 
 import argparse
