@@ -102,6 +102,9 @@ def test_the_expert_and_the_demonstration_in_its_own_scene_succeed(ml10: Domain)
         policy = loop.policies[name](DRAWER, initial, shown, 0)
         assert policy is not None
         assert loop.judge(DRAWER, roll_out(loop, initial, policy))["success"].all(), name
+    policy = loop.policies["expert (oracle)"](DRAWER, starts, shown, 0)
+    assert policy is not None
+    assert not loop.judge(PLACE, roll_out(loop, starts, policy))["success"].any()  # its scenes are of another task
     assert loop.policies["shifted demonstration"](DRAWER, starts, None, 0) is None  # a training concept has none
 
 

@@ -140,6 +140,9 @@ class AllWeights(Adaptation):
         loss: quantity of a diffusion model's squared error.
         output: folder for the concepts; ``None`` for ``concepts`` in the log folder.
         seed: seed of weights, windows and the evaluation's rows.
+
+    Raises:
+        UserError: for ``scratch`` with our model.
     """
 
     learns = True
@@ -156,6 +159,8 @@ class AllWeights(Adaptation):
         seed: int = 0,
     ) -> None:
         super().__init__(pretrained, 1.0, output)
+        own = isinstance(self.model, ChunkModel)
+        require(own or not scratch, "model.scratch", f"false for a model of {self.model.method.name}", scratch)
         self.save_hyperparameters()
 
     @property
@@ -175,7 +180,7 @@ class AllWeights(Adaptation):
         shown, model = self.demonstrations.select(name), copy.copy(self.model)
         key = "network" if isinstance(model, ChunkModel) else "denoiser"
         before, network = self.model.get_submodule(key), copy.deepcopy(self.model.get_submodule(key)).requires_grad_(True)
-        if options["scratch"] and isinstance(model, ChunkModel):
+        if options["scratch"]:
             with torch.random.fork_rng(devices=[]):
                 torch.manual_seed(options["seed"])
                 network = Regressor(model.config)

@@ -14,7 +14,7 @@ from ftl_lightning.domains.domain import EXECUTED, Concepts, Domain, Plans, View
 from ftl_lightning.domains.execution import ClosedLoop, Policy, Rollout
 from ftl_lightning.domains.pictures import Show
 from ftl_metaworld.environment import COLUMNS, FIRST, GOAL, GRIPPER, HAND, MAX_STEPS, SECOND, UNITS, WORLD, MetaWorld
-from ftl_metaworld.tasks import NUMBERS, suites, texts
+from ftl_metaworld.tasks import NUMBER, NUMBERS, suites, texts
 
 if TYPE_CHECKING:
     from ftl_metaworld.source import Experts
@@ -54,9 +54,10 @@ def act(plans: Tensor, step: int, observed: Observed) -> Tensor:
 
 
 def judge(goal: str, rollout: Rollout) -> dict[str, Tensor]:
-    """Success as Meta-World defines it: its criterion holds at any step."""
+    """Success as Meta-World defines it: its criterion holds at any step; of no scene of another task."""
+    same = rollout.starts.require_scenes()[:, 0] == NUMBER[goal]
     success = torch.tensor([bool(info.get("success")) for info in rollout.infos])
-    return {"success": success & ~rollout.failed}
+    return {"success": success & same & ~rollout.failed}
 
 
 def expert(goal: str, starts: InitialStates, demonstrations: Demonstrations | None, seed: int) -> Policy:
