@@ -181,6 +181,7 @@ class AllWeights(Adaptation):
         key = "network" if isinstance(model, ChunkModel) else "denoiser"
         before, network = self.model.get_submodule(key), copy.deepcopy(self.model.get_submodule(key)).requires_grad_(True)
         if options["scratch"]:
+            assert isinstance(model, ChunkModel)
             with torch.random.fork_rng(devices=[]):
                 torch.manual_seed(options["seed"])
                 network = Regressor(model.config)
