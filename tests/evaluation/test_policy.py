@@ -157,6 +157,7 @@ def test_a_controller_of_the_user_gets_present_and_next_planned_state(quick: Few
     assert calls[0][0].shape == (1, 2)
 
 
+@pytest.mark.slow
 def test_demonstrations_are_moved_to_the_places_of_the_model(quick: FewShot) -> None:
     concept = quick.learn(shown(2, 5, 50), name="new", form="shifted demonstration")
     assert concept.concept.reference is not None
