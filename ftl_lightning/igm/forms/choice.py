@@ -78,7 +78,8 @@ def learn(
         watch, start: of the first inversion, with :func:`first_settings`.
     """
     model.check_settings(settings)
-    first = invert(model, demonstrations, first_settings(settings), steps, tell, watch, start)
+    most = _adapter_steps(settings, steps) if settings.form == ADAPTED else steps
+    first = invert(model, demonstrations, first_settings(settings), most, tell, watch, start)
     if settings.form in (UNSAID, PAPER):
         return first
     variation = 0.0 if model.variations is None else VARIATION
@@ -95,12 +96,12 @@ def _formed(
     model: Invertible, demonstrations: Demonstrations, settings: InversionSettings, steps: int, first: Concepts, tell: Tell
 ) -> Mapping[str, Concept]:
     """The concepts in the form of the settings, learned from demonstrations; ``first`` are those of one set."""
-    if settings.form == ONE:
+    if settings.form in (ONE, ADAPTED):
         return first
     if settings.form == MODES:
         return _with_modes(model, demonstrations, settings, steps, first, tell)
-    if settings.form in (ADAPTED, MIXED):
-        return _adapted(model, demonstrations, settings, steps, settings.form == MIXED, tell)
+    if settings.form == MIXED:
+        return _adapted(model, demonstrations, settings, steps, True, tell)
     if settings.form == COMBINED:
         combinations = {name: Combination.of(model, demonstrations.select(name), settings) for name in first}
         return {name: _combined(model, combinations[name], concept) for name, concept in first.items()}
@@ -108,8 +109,22 @@ def _formed(
 
 
 def first_settings(settings: InversionSettings) -> InversionSettings:
-    """Settings of the first inversion: unchanged in the paper's form, else one set without an adapter."""
+    """Settings of the first inversion: unchanged in the paper's form, else one set, with an adapter if it is the form."""
+    if settings.form == ADAPTED:
+        return _with_adapter(settings, False)
     return settings if settings.form in (UNSAID, PAPER) else _one_set(settings)
+
+
+def _with_adapter(settings: InversionSettings, mixed: bool) -> InversionSettings:
+    """One set and an adapter, or with ``mixed`` a mode of each demonstration that share an adapter."""
+    rank, rate = (settings.adapter.rank, settings.adapter.learning_rate) if settings.adapter.rank else (RANK, RATE)
+    changes = {"modes": "each" if mixed else 1, "adapter": rank, "adapter_learning_rate": rate, "tolerance": None}
+    return settings.from_one_start(form=PAPER, **changes)
+
+
+def _adapter_steps(settings: InversionSettings, steps: int) -> int:
+    """Steps of an adapter: all for a rank of the settings."""
+    return steps if settings.adapter.rank else min(steps, ADAPTER_STEPS)
 
 
 def _one_set(settings: InversionSettings, **changes: Any) -> InversionSettings:
@@ -146,13 +161,10 @@ def _adapted(
     by_sample: bool = False,
 ) -> dict[str, Concept]:
     """Concepts of one set and an adapter; with ``mixed``, of mixtures that share an adapter (several demonstrations only)."""
-    adapter = settings.adapter
-    rank, rate = (adapter.rank, adapter.learning_rate) if adapter.rank else (RANK, RATE)
-    changes = {"modes": "each" if mixed else 1, "adapter": rank, "adapter_learning_rate": rate, "tolerance": None}
-    one = settings.from_one_start(form=PAPER, **changes)
-    most = SKILLED_STEPS if by_sample else steps if adapter.rank else ADAPTER_STEPS
+    one = _with_adapter(settings, mixed)
+    most = min(steps, SKILLED_STEPS) if by_sample else _adapter_steps(settings, steps)
     start = Inversion(model, demonstrations, one, by_sample).to(model.device)
-    concepts = invert(model, demonstrations, one, min(steps, most), tell, start=start)
+    concepts = invert(model, demonstrations, one, most, tell, start=start)
     for name, concept in concepts.items():
         if concept.modes:
             modes = replace(concept.modes, mixed=True, stretch=even_stretch(len(concept.modes)))
