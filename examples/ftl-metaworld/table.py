@@ -19,7 +19,7 @@ from ftl_lightning.reporting.paired import holm, sign_flip
 RESULTS = Path(__file__).resolve().parent / "results"
 SUCCESS = "closed loop success"
 METHODS: Mapping[str, tuple[str, str]] = {
-    "**FTL-IGM, form chosen**": ("FTL-IGM", "form chosen"),
+    "**FTL-IGM, with adapter**": ("FTL-IGM", "with adapter"),
     "FTL-IGM, the paper's form": ("FTL-IGM", ""),
     "LoRA fine-tuning of our model": ("LoRA fine-tuning", ""),
     "full fine-tuning of our model": ("full fine-tuning", ""),
@@ -33,7 +33,15 @@ METHODS: Mapping[str, tuple[str, str]] = {
     "*expert, scripted*": ("expert (oracle)", ""),
 }
 """Method and form of the rows, by name in the tables; references in italics."""
-OURS = "**FTL-IGM, form chosen**"
+OURS = "**FTL-IGM, with adapter**"
+TUNED = {
+    "tuning": "five, every 8 steps",
+    "tuning_few": "three, every 2 steps",
+    "tuning_slow": "three, every 8 steps",
+}
+"""Rows of settings that were tried, and what they have in common."""
+TEMPERATURES = (0.5, 1.0)
+"""Temperatures of our model in the order of ``conf/tuning_few.yaml``."""
 
 
 def number(value: float) -> str:
@@ -104,14 +112,20 @@ def paired(rows: pd.DataFrame) -> str:
     return table(["ours against", "difference", "tasks ahead / equal / behind", "p (Holm)"], lines)
 
 
-def tuning(rows: pd.DataFrame) -> str:
+def tuning(folder: Path) -> str:
     """Settings of every method on the validation tasks."""
-    rows = rows.assign(called=[f"{method} {form}".strip() for method, form in zip(rows["method"], rows["form"], strict=True)])
-    lines = [
-        [str(called), f"{variant}, omega {omega}", number(float(part["value"].mean()))]
-        for (called, variant, omega, _), part in rows.groupby(["called", "variant", "omega", "config_hash"], sort=False)
-    ]
-    return table(["method", "setting", "success on the six validation tasks"], lines)
+    lines = []
+    for name, means in TUNED.items():
+        tried: dict[tuple[str, str], int] = {}
+        rows = read(folder / f"{name}.csv")
+        rows = rows.assign(called=[f"{method} {form}".strip() for method, form in zip(rows["method"], rows["form"], strict=True)])
+        for (called, variant, omega, _), part in rows.groupby(["called", "variant", "omega", "config_hash"], sort=False):
+            setting = f"{variant}, omega {omega}" if omega != "none" else str(variant)
+            number_tried = tried[called, setting] = tried.get((called, setting), -1) + 1
+            if name == "tuning_few" and omega != "none" and "BC" not in called:
+                setting += f", temperature {TEMPERATURES[min(number_tried, 1)]:g}"
+            lines.append([means, str(called), setting, number(float(part["value"].mean()))])
+    return table(["demonstrations, plans", "method", "setting", "success on the six validation tasks"], lines)
 
 
 def forgotten(rates: Mapping[str, Sequence[float]]) -> str:
@@ -131,7 +145,7 @@ def experts(rates: Mapping[str, Mapping[str, float]]) -> str:
 
 def composed(rows: pd.DataFrame) -> str:
     """Tasks behind a wall by a composition, by the task without a wall, and by their own training concept."""
-    ours = rows[(rows["domain"] == "ml45") & (rows["method"] == "FTL-IGM") & (rows["form"] == "form chosen")]
+    ours = rows[(rows["domain"] == "ml45") & (rows["method"] == "FTL-IGM") & (rows["form"] == "with adapter")]
     named = {"composition": "both concepts", "one of both": "without the way past a wall", "training concept": "its own concept"}
     goals = list(dict.fromkeys(ours[ours["setting"] == "composition"]["task"]))
     lines = [
@@ -164,8 +178,7 @@ def main() -> None:
     for name, write in (("forgetting", forgotten), ("experts", experts)):
         if (path := folder / f"{name}.json").is_file():
             made[f"{name}"] = write(json.loads(path.read_text("utf-8")))
-    if len(tried := read(folder / "tuning.csv")):
-        made["tuning"] = tuning(tried)
+    made["tuning"] = tuning(folder)
     for name, text in made.items():
         (folder / f"{name}.md").write_text(text, "utf-8")
     for name, text in made.items():

@@ -40,7 +40,7 @@ def _compiled(path: str) -> "mujoco.MjModel":
 
 @functools.cache
 def simulator(name: str) -> type[Any]:
-    """Meta-World's class of a task, in the variant that observes the goal, without compiling its model for every instance."""
+    """Meta-World's class of a task, in the variant that observes the goal, faster: its model is compiled once."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         from metaworld.env_dict import ALL_V3_ENVIRONMENTS
@@ -53,6 +53,14 @@ def simulator(name: str) -> type[Any]:
 
             model = copy.copy(_compiled(self.fullpath))
             return model, mujoco.MjData(model)
+
+        def touching_object(self, object_geom_id: int) -> bool:
+            """As Meta-World's, which makes an object of every contact: a quarter of the time of a step."""
+            contact, forces = self.data.contact, self.data.efc_force
+            ends = np.stack((contact.geom1, contact.geom2))
+            touched = (ends == object_geom_id).any(axis=0)
+            pads = (self.data.geom(f"{side}pad_geom").id for side in ("left", "right"))
+            return all(sum(forces[contact.efc_address[touched & (ends == pad).any(axis=0)]]) > 0 for pad in pads)
 
     return Simulator
 
