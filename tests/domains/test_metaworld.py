@@ -76,6 +76,21 @@ def test_an_episode_follows_from_scene_and_actions(ml10: Domain) -> None:
     assert np.array_equal(episode(fresh), episode(fresh))
 
 
+def test_touches_are_those_of_the_benchmark(ml10: Domain) -> None:
+    from ftl_metaworld.environment import MetaWorld
+    from ftl_metaworld.source import act, scenes
+    from metaworld.sawyer_xyz_env import SawyerXYZEnv
+
+    env, touched = MetaWorld(), set()
+    env.reset(options={"scene": next(scenes("pick up a block and put it on a shelf", 3))})
+    for _ in range(60):
+        env.step(act(env))
+        geom = env._simulator._get_id_main_object()
+        touched.add(env._simulator.touching_object(geom))
+        assert env._simulator.touching_object(geom) == SawyerXYZEnv.touching_object(env._simulator, geom)
+    assert touched == {False, True}
+
+
 def test_demonstrations_succeed_and_hold_the_actions_of_the_expert(ml10: Domain) -> None:
     from ftl_metaworld.environment import MetaWorld
     from ftl_metaworld.source import act

@@ -228,3 +228,11 @@ def test_what_is_learned_first_stops_by_itself_where_the_form_is_to_be_chosen() 
     first = first_settings(settings)
     assert (first.budget.tolerance, first.adapter.rank, first.modes.sets) == (TOLERANCE, 0, 1)
     assert first_settings(settings.changed(form=MODES)).budget.tolerance is None
+
+
+def test_the_form_with_an_adapter_is_learned_at_once(model: FewShot) -> None:
+    steps: list[int] = []
+    learned = model.learn(scenes(model), steps=4, form=ADAPTED, adapter=2, watch=lambda now: steps.append(now.step))
+    assert steps == [1, 2, 3, 4]
+    assert learned.concept.adapter is not None
+    assert first_settings(InversionSettings(form=ADAPTED).changed(adapter=3)).adapter.rank == 3
