@@ -236,11 +236,7 @@ def _overview(results: pd.DataFrame, lines: Sequence[tuple[Domain, str, str]], c
         cells.append([*line, *(cell_of[method] for method in rest)])
     head = ["domain: setting, metric", "lead", *(label(*method) for method in first)]
     head += [OTHER_FORMS] * bool(forms) + [label(*method) for method in rest]
-    unpublished = [domain.name for domain in _domains(results) if not published(domain)]
-    ours = ""
-    if forms and 0 < len(unpublished) < len(_domains(results)):
-        named = " and ".join(unpublished)
-        ours = f". {label(*PAPERS_METHOD)}: the paper's form of the concept; in {named} network, view and loss are ours"
+    ours = f". {label(*PAPERS_METHOD)}: the paper's form of the concept; networks, views and losses are ours" if forms else ""
     caption = (
         f"Ours and the baselines, mean ± standard error over tasks{_brackets(results)}; lead: by how much ours is better than the "
         f"best baseline{ours}"
@@ -249,7 +245,7 @@ def _overview(results: pd.DataFrame, lines: Sequence[tuple[Domain, str, str]], c
 
 
 def _brackets(results: pd.DataFrame) -> str:
-    return " [the paper's, in the same setting]" if any(map(published, _domains(results))) else ""
+    return " [the paper's number, in a setting that differs]" if any(map(published, _domains(results))) else ""
 
 
 def _domains(results: pd.DataFrame) -> list[Domain]:
