@@ -102,7 +102,7 @@ def _followed(of: Settings) -> str:
 
 ROWS: tuple[tuple[str, Callable[[Settings], str], str], ...] = (
     ("network", _network, "MLP; temporal U-Net of width 128 in all domains but object rearrangement; ResNet-18 for images"),
-    ("pretraining: steps x windows", _pretraining, "not said"),
+    ("pretraining: steps x windows", _pretraining, "a million x 64 (by reference to Decision Diffuser)"),
     ("form of a concept", _concept, "K = 2, one set, alike at all times"),
     ("guidance weight omega", _omega, "1.2; 1.6; learned; 1.8; learned (in this order)"),
     ("weight of a training concept beside a learned one", _training_weight, "omega, or 1 where that is learned"),

@@ -2,7 +2,7 @@
 
     python experts.py
 
-20 episodes a task. With a hidden goal an expert reads zeros in its place, as in Meta-World's partially observed variant.
+Ten episodes a task. With a hidden goal an expert reads zeros in its place, as in Meta-World's partially observed variant.
 """
 
 import argparse
@@ -16,7 +16,7 @@ from ftl_metaworld.source import act, scenes
 from ftl_metaworld.tasks import TEXTS
 
 OUT = Path(__file__).resolve().parent / "results" / "experts.json"
-EPISODES, SEED = 20, 4_000_000
+EPISODES, SEED = 10, 4_000_000
 
 
 def succeeds(env: MetaWorld, scene: np.ndarray, hidden: bool) -> bool:
