@@ -2,9 +2,9 @@
 
     python forgetting.py
 
-Concepts are those of ``conf/table.yaml``, seed 0. After each of the five test tasks, five episodes of each training task. Our method
-adds a concept and leaves the network as it is: plans of training tasks stay the same, bit by bit, which is checked. LoRA and full
-fine-tuning change the network for all concepts.
+Concepts are those of ``conf/table.yaml``, seed 0. After each of the five test tasks, five episodes of each training task. Our
+method adds a concept and leaves the network as it is: plans of training tasks stay the same, bit by bit, which is checked. LoRA and
+full fine-tuning change the network for all concepts.
 """
 
 import argparse

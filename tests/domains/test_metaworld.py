@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from pathlib import Path
 
+import nbformat
 import numpy as np
 import pytest
 import torch
@@ -172,3 +173,13 @@ def test_the_rival_is_pretrained_adapted_and_learned_from_scratch(ml10: Domain) 
         configs = [f"--config={FOLDER / 'conf' / f'{name}.yaml'}" for name in names]
         assert main(["invert", *configs, *small, f"--model.output=concepts{number}"]) == 0
         assert len(list(Path(f"concepts{number}").glob("*.safetensors"))) == 5
+
+
+@pytest.mark.notebook
+def test_the_notebook_runs(ml10: Domain, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(FOLDER)
+    cells = [cell for cell in nbformat.read("meta_world.ipynb", as_version=4).cells if cell.cell_type == "code"]
+    names: dict[str, object] = {}
+    for cell in cells:
+        exec(compile(cell.source, "meta_world.ipynb", "exec"), names)
+        assert cell.outputs or cell is cells[0]
