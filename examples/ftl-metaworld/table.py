@@ -122,7 +122,7 @@ def tuning(folder: Path) -> str:
         for (called, variant, omega, _), part in rows.groupby(["called", "variant", "omega", "config_hash"], sort=False):
             setting = f"{variant}, omega {omega}" if omega != "none" else str(variant)
             number_tried = tried[called, setting] = tried.get((called, setting), -1) + 1
-            if name == "tuning_few" and omega != "none" and "BC" not in called:
+            if name == "tuning_few" and called in ("FTL-IGM with adapter", "LoRA fine-tuning"):
                 setting += f", temperature {TEMPERATURES[min(number_tried, 1)]:g}"
             lines.append([means, str(called), setting, number(float(part["value"].mean()))])
     return table(["demonstrations, plans", "method", "setting", "success on the six validation tasks"], lines)
