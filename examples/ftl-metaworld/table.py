@@ -121,9 +121,9 @@ def tuning(folder: Path) -> str:
         rows = rows.assign(called=[f"{method} {form}".strip() for method, form in zip(rows["method"], rows["form"], strict=True)])
         for (called, variant, omega, _), part in rows.groupby(["called", "variant", "omega", "config_hash"], sort=False):
             setting = f"{variant}, omega {omega}" if omega != "none" else str(variant)
-            number_tried = tried[called, setting] = tried.get((called, setting), -1) + 1
+            before = tried[str(called), setting] = tried.get((str(called), setting), -1) + 1
             if name == "tuning_few" and called in ("FTL-IGM with adapter", "LoRA fine-tuning"):
-                setting += f", temperature {TEMPERATURES[min(number_tried, 1)]:g}"
+                setting += f", temperature {TEMPERATURES[before]:g}"
             lines.append([means, str(called), setting, number(float(part["value"].mean()))])
     return table(["demonstrations, plans", "method", "setting", "success on the six validation tasks"], lines)
 
