@@ -128,10 +128,11 @@ def tuning(folder: Path) -> str:
     return table(["demonstrations, plans", "method", "setting", "success on the six validation tasks"], lines)
 
 
-def forgotten(rates: Mapping[str, Sequence[float]]) -> str:
-    """Mean success on the training tasks after a test task was learned."""
-    lines = [[method, number(sum(values) / len(values)), str(len(values))] for method, values in rates.items()]
-    return table(["learned by", "success on training tasks", "pairs of test task and training task"], lines)
+def forgotten(rates: Mapping[str, Mapping[str, float]]) -> str:
+    """Mean success on the training tasks before and after a test task was learned."""
+    lines = [[method, number(each["before"]), number(each["after"]), str(each["pairs"])] for method, each in rates.items()]
+    head = ["learned by", "training tasks before", "training tasks after", "pairs of test task and training task"]
+    return table(head, lines)
 
 
 def experts(rates: Mapping[str, Mapping[str, float]]) -> str:
