@@ -47,7 +47,7 @@ html_show_sourcelink = False
 OUTSIDE = ((r"(?:\.\./)+notebooks/([\w/]+)\.ipynb", "/notebooks"), (r"(?:\.\./)+pretrained/(\w+)/README\.md", "/cards"))
 BACK, BESIDE = re.compile(r"\]\((?:\.\./)+docs/([^)]*\.md(?:#[^)]*)?)\)"), re.compile(r"\[([^][\n]*)\]\(([\w/]+)\.ipynb\)")
 """Notebooks' links to pages of this folder, and to one another."""
-DOWNLOADS = re.compile(r"\]\(((?:\.\./)+(?:(?:results|ftl_lightning|examples|conf)/[^)]*|CHANGELOG|CONTRIBUTING)\.md)\)")
+DOWNLOADS = re.compile(r"\]\(((?:\.\./)+(?:(?:results|ftl_lightning|examples|conf)/[^)]*|CHANGELOG|CONTRIBUTING)\.(?:md|ipynb))\)")
 
 
 def _links(app: Sphinx, page: str, source: list[str]) -> None:
