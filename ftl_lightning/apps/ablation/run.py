@@ -1,6 +1,7 @@
 """Check a plan, and run it cell by cell, here or on a cluster."""
 
 import importlib
+import itertools
 import socket
 import tempfile
 import time
@@ -15,12 +16,25 @@ from typing import TYPE_CHECKING, Literal
 
 from ftl_lightning.apps.ablation.cluster import cluster
 from ftl_lightning.apps.ablation.plan import Cell, Stage
-from ftl_lightning.apps.ablation.record import Outcome, Run, State, Tell, by_node, count_states, estimate, read_record, table, tell
+from ftl_lightning.apps.ablation.record import (
+    CellRecord,
+    Outcome,
+    Run,
+    State,
+    Tell,
+    by_node,
+    count_states,
+    estimate,
+    read_record,
+    table,
+    tell,
+)
 from ftl_lightning.services import log_folder
 from ftl_lightning.services.configuration import load
 from ftl_lightning.services.errors import UserError, require
 from ftl_lightning.services.progress import bar
 from ftl_lightning.services.shipped import pretrained_folder
+from ftl_lightning.services.tensor_file import content_hash
 from ftl_lightning.services.text import say
 from ftl_lightning.services.trust import check_module
 
@@ -100,26 +114,28 @@ def run_ablation(
 
     all_cells = [cell for cells in plan for cell in cells]
     check(all_cells)
-    read_record(results)  # fails early if damaged
+    to_run = cells_to_run(plan, results)
     total, number, failed = len(all_cells), 0, []
     start = time.monotonic()
     noted = partial(tell, results)
     states: dict[str, State] = {cell.name: "queued" for cell in all_cells}
 
     def record_state(cell: Cell, state: State, node: str, note: str) -> None:
-        noted([cell], state, node, note)
+        noted([cell], state, Outcome(note=note, node=node))
         states[cell.name] = state
         advance(0, count_states(list(states.values())))
         if state == "again":
             say(f"{cell}: runs again, lost on {node or 'its machine'}: {note}")
 
     with (
-        _executor(executor, address, [cell for cell in all_cells if not _is_made(cell)]) as run,
+        _executor(executor, address, [cell for cells in to_run for cell in cells]) as run,
         bar("cells", total, lines=False) as advance,
     ):
         noted(all_cells, "queued")
-        for cells in plan:
-            for cell, outcome in run(cells, known_hashes(results), record_state):
+        for cells, needed in zip(plan, to_run, strict=True):
+            notes = {"fit": "done before", "invert": "in the results already"}
+            skipped = ((cell, Outcome(note=notes[cell.verb])) for cell in cells if cell not in needed)
+            for cell, outcome in itertools.chain(skipped, run(needed, known_hashes(results), record_state)):
                 number += 1
                 minutes = (time.monotonic() - start) / number * (total - number) / 60
                 note = f"failed: {outcome.error}\n  {cell.command}" if outcome.error else outcome.note
@@ -129,7 +145,7 @@ def run_ablation(
                 if outcome.error:
                     failed.append(f"{cell}: {outcome.error}")
                 states[cell.name] = "failed" if outcome.error else "done"
-                noted([cell], states[cell.name], outcome.node, outcome.error or outcome.note, outcome.seconds)
+                noted([cell], states[cell.name], outcome)
                 advance(1, count_states(list(states.values())))
     if failed or executor == "ray":
         show_cells(results, all_cells)
@@ -165,17 +181,28 @@ def planned(stages: Sequence[Stage], seeds: Sequence[int], root: str = "", only:
 
 def show_estimate(plan: Sequence[Sequence[Cell]], results: str, workers: int = 0) -> None:
     """Check the cells of each stage; print how many are to run, and the estimated hours for some workers (0: several numbers)."""
-    total = sum(map(len, plan))
     check([cell for cells in plan for cell in cells])
-    known = known_hashes(results)
-    with bar("cells looked at", total, lines=False) as advance:
+    say("\n".join(estimate(cells_to_run(plan, results), read_record(results), sum(map(len, plan)), workers)))
 
-        def needed(cell: Cell) -> bool:
-            advance()
-            return not _is_done(cell, known)
 
-        to_run = [[cell for cell in cells if needed(cell)] for cells in plan]
-    say("\n".join(estimate(to_run, read_record(results), total, workers)))
+def cells_to_run(plan: Sequence[Sequence[Cell]], results: str) -> list[list[Cell]]:
+    """The cells of each stage that must run, as their rows are missing. A pretraining that ran before, and whose model is missing,
+    is left out if cells of the plan read the model and none of them must run.
+    """
+    known, record = known_hashes(results), read_record(results)
+    needed: list[list[Cell]] = []
+    read: dict[str, bool] = {}  # by folder of a model: whether a cell that must run reads it
+    with bar("cells looked at", sum(map(len, plan)), lines=False) as advance:
+        for cells in reversed(plan):
+            needed.insert(0, [])
+            for cell in cells:
+                again = cell.verb == "fit" and not _is_made(cell) and read.get(cell.options.get("model.output", ""), True)
+                if run := again or not _is_done(cell, known, record):
+                    needed[0].append(cell)
+                model = cell.options.get("model.pretrained", "")
+                read[model] = run or read.get(model, False)
+                advance()
+    return needed
 
 
 def _is_made(cell: Cell) -> bool:
@@ -183,9 +210,14 @@ def _is_made(cell: Cell) -> bool:
     return bool(cell.done) and Path(cell.done).is_file()
 
 
-def _is_done(cell: Cell, known: set[str]) -> bool:
-    """Whether a cell need not run; a cell whose pretrained model is missing must run."""
+def _is_done(cell: Cell, known: set[str], record: Mapping[str, CellRecord]) -> bool:
+    """Whether a cell's rows are in the results, or its model exists. Without the pretrained model, whose hash is needed, the record
+    of a run with the same settings decides.
+    """
     if _is_made(cell):
+        return True
+    entry = record.get(cell.name, CellRecord())
+    if entry.settings and (cell.verb == "fit" or entry.config_hash in known) and entry.settings == _settings(cell):
         return True
     if cell.verb == "fit" or not known:
         return False
@@ -194,6 +226,13 @@ def _is_done(cell: Cell, known: set[str]) -> bool:
     with log_folder.run(), suppress(UserError, ArgumentError):
         return _hash(build(cell.verb, [*cell.arguments, *_log(cell)])) in known
     return False
+
+
+def _settings(cell: Cell) -> str:
+    """Hash of the values of all options of a cell."""
+    from ftl_lightning.apps.lightning_cli import parse
+
+    return content_hash(parse(cell.verb, cell.arguments))
 
 
 def show_cells(results: str, cells: Sequence[Cell]) -> None:
@@ -237,7 +276,7 @@ def attempt(cell: Cell, known: set[str], again: bool = False) -> Outcome:
         try:
             line = build(cell.verb, [*cell.arguments, *_log(cell), f"--evaluation.results={path}"])
             if cell.verb == "invert" and _hash(line) in known:
-                return Outcome(note="in the results already")
+                return Outcome(note="in the results already", settings=_settings(cell), config_hash=_hash(line))
             start = time.monotonic()
             more = {"ckpt_path": last_checkpoint(line.trainer)} if again and cell.verb == "fit" else {}
             getattr(line.trainer, cell.verb)(line.model, datamodule=line.datamodule, **more)
@@ -248,7 +287,8 @@ def attempt(cell: Cell, known: set[str], again: bool = False) -> Outcome:
             return Outcome(error=repr(error))
         rows = read_rows(path) if path.is_file() else None
         seconds = time.monotonic() - start
-    return Outcome(rows, "done" if rows is None else f"{len(rows)} rows", seconds=seconds)
+    note, config_hash = ("done", "") if rows is None else (f"{len(rows)} rows", rows["config_hash"].iloc[0])
+    return Outcome(rows, note, seconds=seconds, settings=_settings(cell), config_hash=config_hash)
 
 
 def _log(cell: Cell) -> list[str]:
