@@ -124,7 +124,7 @@ def test_a_failing_cell_is_told_at_the_end_and_stops_no_other(quick: dict[str, A
 
 
 DRIVING = {"verb": "invert", "config": f"{CONF}/{{method}}/driving.yaml", "options": {"model.pretrained": "models/{method}"}}
-UNKNOWN_SUITE = """evaluation.suites: expected some of training, paper, components, validation, compositions \
+UNKNOWN_SUITE = """evaluation.suites: expected some of training, paper, components, validation, compositions, more \
 (domain object_rearrangement), found exam"""
 OF_ANOTHER_DOMAIN = (
     "expected a model of driving (diffusion or bc or regression or cvae), found one of object_rearrangement (diffusion)"

@@ -56,8 +56,8 @@ Attempt = Callable[[Cell, set[str], bool], Outcome]
 @dataclass(frozen=True)
 class CellRecord:
     """Recorded state of a cell, with configuration files, last machine, attempts by the last command, and outcome or error.
-    ``seconds`` is the duration of the last complete run; 0 for none. ``settings`` is the hash of its options, defaults included;
-    ``config_hash`` that of its rows, if it has any.
+    ``seconds`` is the duration of the last complete run; 0 for none. ``config_hash`` is that of its rows, if it has any;
+    ``settings`` then is the hash of its options, defaults included, and of the pretraining of its model.
     """
 
     state: State = "queued"

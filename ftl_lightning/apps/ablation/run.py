@@ -45,6 +45,8 @@ if TYPE_CHECKING:
 
 MOST_SEEDS = 1000
 """Maximum number of seeds of an ablation."""
+IN_RESULTS = "in the results already"
+"""Note of a cell that need not be run."""
 
 
 def check(cells: Sequence[Cell]) -> None:
@@ -114,7 +116,7 @@ def run_ablation(
 
     all_cells = [cell for cells in plan for cell in cells]
     check(all_cells)
-    to_run = cells_to_run(plan, results)
+    known_outcomes, fits = outcomes(plan, results), _fits(plan)
     total, number, failed = len(all_cells), 0, []
     start = time.monotonic()
     noted = partial(tell, results)
@@ -128,13 +130,12 @@ def run_ablation(
             say(f"{cell}: runs again, lost on {node or 'its machine'}: {note}")
 
     with (
-        _executor(executor, address, [cell for cells in to_run for cell in cells]) as run,
+        _executor(executor, address, [cell for cells in to_run(known_outcomes) for cell in cells]) as run,
         bar("cells", total, lines=False) as advance,
     ):
         noted(all_cells, "queued")
-        for cells, needed in zip(plan, to_run, strict=True):
-            notes = {"fit": "done before", "invert": "in the results already"}
-            skipped = ((cell, Outcome(note=notes[cell.verb])) for cell in cells if cell not in needed)
+        for stage, needed in zip(known_outcomes, to_run(known_outcomes), strict=True):
+            skipped = ((cell, outcome) for cell, outcome in stage if outcome is not None)
             for cell, outcome in itertools.chain(skipped, run(needed, known_hashes(results), record_state)):
                 number += 1
                 minutes = (time.monotonic() - start) / number * (total - number) / 60
@@ -145,6 +146,8 @@ def run_ablation(
                 if outcome.error:
                     failed.append(f"{cell}: {outcome.error}")
                 states[cell.name] = "failed" if outcome.error else "done"
+                if outcome.config_hash:
+                    outcome = replace(outcome, settings=_settings(cell, fits))
                 noted([cell], states[cell.name], outcome)
                 advance(1, count_states(list(states.values())))
     if failed or executor == "ray":
@@ -182,27 +185,35 @@ def planned(stages: Sequence[Stage], seeds: Sequence[int], root: str = "", only:
 def show_estimate(plan: Sequence[Sequence[Cell]], results: str, workers: int = 0) -> None:
     """Check the cells of each stage; print how many are to run, and the estimated hours for some workers (0: several numbers)."""
     check([cell for cells in plan for cell in cells])
-    say("\n".join(estimate(cells_to_run(plan, results), read_record(results), sum(map(len, plan)), workers)))
+    say("\n".join(estimate(to_run(outcomes(plan, results)), read_record(results), sum(map(len, plan)), workers)))
 
 
-def cells_to_run(plan: Sequence[Sequence[Cell]], results: str) -> list[list[Cell]]:
-    """The cells of each stage that must run, as their rows are missing. A pretraining that ran before, and whose model is missing,
-    is left out if cells of the plan read the model and none of them must run.
+def outcomes(plan: Sequence[Sequence[Cell]], results: str) -> list[list[tuple[Cell, Outcome | None]]]:
+    """The cells of each stage with the outcome of an earlier run; ``None`` if a cell must run. A pretraining whose model is missing
+    must run if a cell of the plan that must run reads the model, or if no cell of the plan reads it.
     """
-    known, record = known_hashes(results), read_record(results)
-    needed: list[list[Cell]] = []
+    known, record, fits = known_hashes(results), read_record(results), _fits(plan)
+    found: list[list[tuple[Cell, Outcome | None]]] = []
     read: dict[str, bool] = {}  # by folder of a model: whether a cell that must run reads it
     with bar("cells looked at", sum(map(len, plan)), lines=False) as advance:
         for cells in reversed(plan):
-            needed.insert(0, [])
+            found.insert(0, [])
             for cell in cells:
-                again = cell.verb == "fit" and not _is_made(cell) and read.get(cell.options.get("model.output", ""), True)
-                if run := again or not _is_done(cell, known, record):
-                    needed[0].append(cell)
-                model = cell.options.get("model.pretrained", "")
-                read[model] = run or read.get(model, False)
+                if cell.verb == "fit":
+                    again = not _is_made(cell) and read.get(cell.options.get("model.output", ""), True)
+                    outcome = None if again else Outcome(note="done before")
+                else:
+                    outcome = _before(cell, known, record, fits)
+                    model = cell.options.get("model.pretrained", "")
+                    read[model] = outcome is None or read.get(model, False)
+                found[0].append((cell, outcome))
                 advance()
-    return needed
+    return found
+
+
+def to_run(found: Sequence[Sequence[tuple[Cell, Outcome | None]]]) -> list[list[Cell]]:
+    """The cells of each stage of :func:`outcomes` that must run."""
+    return [[cell for cell, outcome in stage if outcome is None] for stage in found]
 
 
 def _is_made(cell: Cell) -> bool:
@@ -210,29 +221,36 @@ def _is_made(cell: Cell) -> bool:
     return bool(cell.done) and Path(cell.done).is_file()
 
 
-def _is_done(cell: Cell, known: set[str], record: Mapping[str, CellRecord]) -> bool:
-    """Whether a cell's rows are in the results, or its model exists. Without the pretrained model, whose hash is needed, the record
-    of a run with the same settings decides.
+def _before(cell: Cell, known: set[str], record: Mapping[str, CellRecord], fits: Mapping[str, Cell]) -> Outcome | None:
+    """Outcome of an inversion whose rows are in the results. The hash of its configuration contains that of the pretrained model;
+    where the model is missing, the record of a run with the same settings decides.
     """
     if _is_made(cell):
-        return True
+        return Outcome(note="done before")
+    if not known:
+        return None
     entry = record.get(cell.name, CellRecord())
-    if entry.settings and (cell.verb == "fit" or entry.config_hash in known) and entry.settings == _settings(cell):
-        return True
-    if cell.verb == "fit" or not known:
-        return False
+    if entry.config_hash in known and entry.settings == _settings(cell, fits):
+        return Outcome(note=IN_RESULTS)
     from ftl_lightning.apps.lightning_cli import build
 
     with log_folder.run(), suppress(UserError, ArgumentError):
-        return _hash(build(cell.verb, [*cell.arguments, *_log(cell)])) in known
-    return False
+        found = _hash(build(cell.verb, [*cell.arguments, *_log(cell)]))
+        return Outcome(note=IN_RESULTS, config_hash=found) if found in known else None
+    return None
 
 
-def _settings(cell: Cell) -> str:
-    """Hash of the values of all options of a cell."""
+def _fits(plan: Sequence[Sequence[Cell]]) -> dict[str, Cell]:
+    """The pretrainings of a plan by the folder of their model."""
+    return {cell.options.get("model.output", ""): cell for cells in plan for cell in cells if cell.verb == "fit"}
+
+
+def _settings(cell: Cell, fits: Mapping[str, Cell]) -> str:
+    """Hash of the values of all options of a cell, and of the pretraining of its model if that is part of the plan."""
     from ftl_lightning.apps.lightning_cli import parse
 
-    return content_hash(parse(cell.verb, cell.arguments))
+    fit = fits.get(cell.options.get("model.pretrained", "")) if cell.verb == "invert" else None
+    return content_hash([parse(one.verb, one.arguments) for one in (cell, fit) if one])
 
 
 def show_cells(results: str, cells: Sequence[Cell]) -> None:
@@ -276,7 +294,7 @@ def attempt(cell: Cell, known: set[str], again: bool = False) -> Outcome:
         try:
             line = build(cell.verb, [*cell.arguments, *_log(cell), f"--evaluation.results={path}"])
             if cell.verb == "invert" and _hash(line) in known:
-                return Outcome(note="in the results already", settings=_settings(cell), config_hash=_hash(line))
+                return Outcome(note=IN_RESULTS, config_hash=_hash(line))
             start = time.monotonic()
             more = {"ckpt_path": last_checkpoint(line.trainer)} if again and cell.verb == "fit" else {}
             getattr(line.trainer, cell.verb)(line.model, datamodule=line.datamodule, **more)
@@ -288,7 +306,7 @@ def attempt(cell: Cell, known: set[str], again: bool = False) -> Outcome:
         rows = read_rows(path) if path.is_file() else None
         seconds = time.monotonic() - start
     note, config_hash = ("done", "") if rows is None else (f"{len(rows)} rows", rows["config_hash"].iloc[0])
-    return Outcome(rows, note, seconds=seconds, settings=_settings(cell), config_hash=config_hash)
+    return Outcome(rows, note, seconds=seconds, config_hash=config_hash)
 
 
 def _log(cell: Cell) -> list[str]:

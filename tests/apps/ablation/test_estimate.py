@@ -101,19 +101,18 @@ def test_what_was_measured_is_known_without_the_models(monkeypatch: pytest.Monke
     fit = next(Stage("fit", "a.yaml", options={"model.output": "logs/m"}, done="logs/m/config.json").cells(0))
     reads, other = (next(Stage("invert", "a.yaml", name=name, options={"model.pretrained": "logs/m"}).cells(0)) for name in "ab")
     plan = [[fit], [reads, other]]
-    monkeypatch.setattr(run, "_settings", lambda cell: f"settings of {cell.name}")
+    monkeypatch.setattr(run, "_settings", lambda cell, fits: f"settings of {cell.name}")
     monkeypatch.setattr(run, "known_hashes", lambda results: {"2:a", "2:b"})
 
     def measured(cell: Cell, config_hash: str) -> None:
         tell("r.csv", [cell], "done", Outcome(settings=f"settings of {cell.name}", config_hash=config_hash))
 
-    measured(fit, "")
     measured(reads, "2:a")
-    assert run.cells_to_run(plan, "r.csv") == [[fit], [other]]
+    assert run.to_run(run.outcomes(plan, "r.csv")) == [[fit], [other]]
     measured(other, "2:c")
-    assert run.cells_to_run(plan, "r.csv") == [[fit], [other]]
+    assert run.to_run(run.outcomes(plan, "r.csv")) == [[fit], [other]]
     measured(other, "2:b")
-    assert run.cells_to_run(plan, "r.csv") == [[], []]
-    assert run.cells_to_run([[fit]], "r.csv") == [[fit]]
-    monkeypatch.setattr(run, "_settings", lambda cell: "changed")
-    assert run.cells_to_run(plan, "r.csv") == plan
+    assert run.to_run(run.outcomes(plan, "r.csv")) == [[], []]
+    assert run.to_run(run.outcomes([[fit]], "r.csv")) == [[fit]]
+    monkeypatch.setattr(run, "_settings", lambda cell, fits: "changed")
+    assert run.to_run(run.outcomes(plan, "r.csv")) == plan
