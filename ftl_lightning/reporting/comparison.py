@@ -236,7 +236,7 @@ def _overview(results: pd.DataFrame, lines: Sequence[tuple[Domain, str, str]], c
             line.append(", ".join(named) or MISSING)
         cells.append([*line, *(cell_of[method] for method in rest)])
     head = ["domain: setting, metric", "lead", *[label(*PAPERS_METHOD)] * bool(ours), *(label(*method) for method in rest)]
-    legend = f". {label(*PAPERS_METHOD)}: first the paper's form of the concept; networks, views and losses are ours"
+    legend = f". {label(*PAPERS_METHOD)}: first the paper's form of the concept; guidance, networks, views and losses are ours"
     caption = (
         f"Ours and the baselines, mean ± standard error over tasks{_brackets(results)}; lead: by how much ours is better than the "
         f"best baseline, with its 95 % interval over tasks{legend * (len(ours) > 1)}"
