@@ -246,11 +246,16 @@ def _fits(plan: Sequence[Sequence[Cell]]) -> dict[str, Cell]:
 
 
 def _settings(cell: Cell, fits: Mapping[str, Cell]) -> str:
-    """Hash of the values of all options of a cell, and of the pretraining of its model if that is part of the plan."""
+    """Hash of the values of all options of a cell but the folder of recordings, and of the pretraining of its model if that is part
+    of the plan.
+    """
     from ftl_lightning.apps.lightning_cli import parse
 
     fit = fits.get(cell.options.get("model.pretrained", "")) if cell.verb == "invert" else None
-    return content_hash([parse(one.verb, one.arguments) for one in (cell, fit) if one])
+    values = [parse(one.verb, one.arguments) for one in (cell, fit) if one]
+    for options in values:
+        options["data"]["init_args"].pop("root", None)
+    return content_hash(values)
 
 
 def show_cells(results: str, cells: Sequence[Cell]) -> None:
