@@ -147,7 +147,7 @@ def run_ablation(
                     failed.append(f"{cell}: {outcome.error}")
                 states[cell.name] = "failed" if outcome.error else "done"
                 if outcome.config_hash:
-                    outcome = replace(outcome, settings=_settings(cell, fits))
+                    outcome = replace(outcome, settings=settings_of(cell, fits))
                 noted([cell], states[cell.name], outcome)
                 advance(1, count_states(list(states.values())))
     if failed or executor == "ray":
@@ -230,7 +230,7 @@ def _before(cell: Cell, known: set[str], record: Mapping[str, CellRecord], fits:
     if not known:
         return None
     entry = record.get(cell.name, CellRecord())
-    if entry.config_hash in known and entry.settings == _settings(cell, fits):
+    if entry.config_hash in known and entry.settings == settings_of(cell, fits):
         return Outcome(note=IN_RESULTS)
     from ftl_lightning.apps.lightning_cli import build
 
@@ -245,7 +245,7 @@ def _fits(plan: Sequence[Sequence[Cell]]) -> dict[str, Cell]:
     return {cell.options.get("model.output", ""): cell for cells in plan for cell in cells if cell.verb == "fit"}
 
 
-def _settings(cell: Cell, fits: Mapping[str, Cell]) -> str:
+def settings_of(cell: Cell, fits: Mapping[str, Cell]) -> str:
     """Hash of the values of all options of a cell but the folder of recordings, and of the pretraining of its model if that is part
     of the plan.
     """
