@@ -9,7 +9,8 @@ import pytest
 import yaml
 
 from ftl_lightning.apps.ablation.plan import Stage, part
-from ftl_lightning.apps.ablation.run import check
+from ftl_lightning.apps.ablation.record import read_record
+from ftl_lightning.apps.ablation.run import check, known_hashes, planned, settings_of
 from ftl_lightning.cli.main import main
 from ftl_lightning.evaluation.results import read_rows
 from ftl_lightning.services.configuration import load
@@ -46,6 +47,24 @@ def test_every_cell_of_an_ablation_has_a_name_of_its_own() -> None:
         content = load(path)
         names = [str(cell) for stage in content["stages"] for seed in content["seeds"] for cell in Stage(**stage).cells(seed)]
         assert len(set(names)) == len(names), path.name
+
+
+PLANS = [path for path in sorted((CONF / "ablation").glob("*.yaml")) if path.stem != "smoke"]
+
+
+@pytest.mark.parametrize("path", PLANS, ids=lambda path: path.stem)
+def test_of_a_committed_plan_nothing_is_to_run(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every inversion is recorded with rows that are in the results, and the first and the last with the settings of today."""
+    monkeypatch.chdir(ROOT)
+    content = load(path)
+    stages = [Stage(**stage) for stage in content["stages"]]
+    plan = list(planned(stages, content["seeds"]).values())
+    cells = [cell for stage in plan for cell in stage if cell.verb == "invert"]
+    record, known = read_record(content["results"]), known_hashes(content["results"])
+    assert [cell.name for cell in cells if record[cell.name].config_hash not in known] == []
+    fits = {cell.options["model.output"]: cell for stage in plan for cell in stage if cell.verb == "fit"}
+    for cell in (cells[0], cells[-1]):
+        assert record[cell.name].settings == settings_of(cell, fits)
 
 
 @pytest.mark.notebook
@@ -124,9 +143,11 @@ def test_a_failing_cell_is_told_at_the_end_and_stops_no_other(quick: dict[str, A
 
 
 DRIVING = {"verb": "invert", "config": f"{CONF}/{{method}}/driving.yaml", "options": {"model.pretrained": "models/{method}"}}
-UNKNOWN_SUITE = """evaluation.suites: expected some of training, paper, components, validation, compositions \
+UNKNOWN_SUITE = """evaluation.suites: expected some of training, paper, components, validation, compositions, more \
 (domain object_rearrangement), found exam"""
-OF_ANOTHER_DOMAIN = "expected a model of driving (diffusion or bc or cvae), found one of object_rearrangement (diffusion)"
+OF_ANOTHER_DOMAIN = (
+    "expected a model of driving (diffusion or bc or regression or cvae), found one of object_rearrangement (diffusion)"
+)
 OF_ANOTHER_VERB = """agent.yaml, pretraining.yaml: expected the configuration of an adaptation (invert), \
 found that of a pretraining (fit)"""
 CANNOT: list[tuple[dict[str, Any], str]] = [

@@ -8,7 +8,7 @@ in turn; each task; paired tests of ours against every method; the settings that
 
 import argparse
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 import pandas as pd
@@ -38,10 +38,9 @@ TUNED = {
     "tuning": "five, every 8 steps",
     "tuning_few": "three, every 2 steps",
     "tuning_slow": "three, every 8 steps",
+    "tuning_fold": "five, every 2 steps, after 40 tasks",
 }
 """Rows of settings that were tried, and what they have in common."""
-TEMPERATURES = (0.5, 1.0)
-"""Temperatures of our model in the order of ``conf/tuning_few.yaml``."""
 
 
 def number(value: float) -> str:
@@ -94,38 +93,39 @@ def each(rows: pd.DataFrame, domain: str) -> str:
     return table([f"success, {domain.upper()}", *names], lines)
 
 
-def paired(rows: pd.DataFrame) -> str:
-    """Ours against every method: two-sided sign-flip tests over the test tasks and those left out in turn."""
-    part = rows[rows["setting"] == "new concept"]
-    ours = of(part, OURS).groupby(["domain", "task"])["value"].mean()
-    lines, values = [], []
-    for name in METHODS:
-        other = of(part, name).groupby(["domain", "task"])["value"].mean()
-        both = ours.index.intersection(other.index)
-        if name == OURS or both.empty:
-            continue
-        apart = ours[both] - other[both]
-        values.append(sign_flip((apart / len(apart)).tolist()))
-        better, worse = int((apart > 1e-6).sum()), int((apart < -1e-6).sum())
-        lines.append([name, f"{apart.mean():+.2f}", f"{better} / {len(apart) - better - worse} / {worse}"])
-    lines = [[*line, f"{p:.3f}"] for line, p in zip(lines, holm(values), strict=True)]
-    return table(["ours against", "difference", "tasks ahead / equal / behind", "p (Holm)"], lines)
+def paired(rows: pd.DataFrame, tuned: Collection[str]) -> str:
+    """Ours against every method: two-sided sign-flip tests over the test tasks, over the tasks left out in turn, and over those of
+    them that are not among the ``tuned`` tasks, on which settings were tried.
+    """
+    new = rows[rows["setting"] == "new concept"]
+    left = new["domain"].str.contains("-")
+    groups = {"test tasks": new[~left], "left out in turn": new[left], "and not tuned on": new[left & ~new["task"].isin(tuned)]}
+    lines = []
+    for group, part in groups.items():
+        ours = of(part, OURS).groupby("task")["value"].mean()
+        others = {name: of(part, name).groupby("task")["value"].mean() for name in METHODS if name != OURS}
+        apart = {name: (ours - other).dropna() for name, other in others.items()}
+        apart = {name: differences for name, differences in apart.items() if len(differences)}
+        p_values = holm([sign_flip((differences / len(differences)).tolist()) for differences in apart.values()])
+        for (name, differences), p in zip(apart.items(), p_values, strict=True):
+            better, worse = int((differences > 1e-6).sum()), int((differences < -1e-6).sum())
+            counts = f"{better} / {len(differences) - better - worse} / {worse}"
+            lines.append([f"{group} ({len(differences)})", name, f"{differences.mean():+.2f}", counts, f"{p:.3f}"])
+    return table(["tasks", "ours against", "difference", "tasks ahead / equal / behind", "p (Holm)"], lines)
 
 
 def tuning(folder: Path) -> str:
-    """Settings of every method on the validation tasks."""
+    """Settings of every method on the validation tasks, by the names of the cells that ``ablate`` recorded."""
     lines = []
     for name, means in TUNED.items():
-        tried: dict[tuple[str, str], int] = {}
         rows = read(folder / f"{name}.csv")
-        rows = rows.assign(called=[f"{method} {form}".strip() for method, form in zip(rows["method"], rows["form"], strict=True)])
-        for (called, variant, omega, _), part in rows.groupby(["called", "variant", "omega", "config_hash"], sort=False):
-            setting = f"{variant}, omega {omega}" if omega != "none" else str(variant)
-            before = tried[str(called), setting] = tried.get((str(called), setting), -1) + 1
-            if name == "tuning_few" and called in ("FTL-IGM with adapter", "LoRA fine-tuning"):
-                setting += f", temperature {TEMPERATURES[before]:g}"
-            lines.append([means, str(called), setting, number(float(part["value"].mean()))])
-    return table(["demonstrations, plans", "method", "setting", "success on the six validation tasks"], lines)
+        for cell, entry in json.loads((folder / f"{name}.cells.json").read_text("utf-8"))["cells"].items():
+            part = rows[rows["config_hash"] == entry["config_hash"]]
+            if len(part):
+                _, *settings, _ = cell.split(", ")
+                method = f"{part['method'].iloc[0]} {part['form'].iloc[0]}".strip()
+                lines.append([means, method, ", ".join(settings), number(float(part["value"].mean()))])
+    return table(["demonstrations, plans", "method", "setting", "success on the validation tasks"], lines)
 
 
 def forgotten(rates: Mapping[str, Mapping[str, float]]) -> str:
@@ -159,7 +159,9 @@ def composed(rows: pd.DataFrame) -> str:
 def read(path: Path) -> pd.DataFrame:
     """Rows of success; none without a file."""
     if not path.is_file():
-        return pd.DataFrame(columns=["domain", "setting", "task", "method", "form", "variant", "omega", "seed", "value"])
+        return pd.DataFrame(
+            columns=["domain", "setting", "task", "method", "form", "variant", "omega", "seed", "config_hash", "value"]
+        )
     rows = pd.read_csv(path, dtype={"omega": str}, keep_default_na=False, na_values={"value": [""]})
     return rows[rows["metric"] == SUCCESS]
 
@@ -171,7 +173,8 @@ def main() -> None:
     folder: Path = parser.parse_args().results
     rows = pd.concat([read(folder / "table.csv"), read(folder / "folds.csv")])
     published = pd.read_csv(Path(__file__).parent / "published.csv", dtype=str, keep_default_na=False)
-    made = {"summary": summary(rows), "paired": paired(rows)}
+    tuned = {task for name in TUNED for task in read(folder / f"{name}.csv")["task"]}
+    made = {"summary": summary(rows), "paired": paired(rows, tuned)}
     made["published"] = table(list(map(str, published)), published.to_numpy().tolist())
     made |= {f"{domain}": each(rows, domain) for domain in ("ml10", "ml45") if domain in set(rows["domain"])}
     if "composition" in set(rows["setting"]):

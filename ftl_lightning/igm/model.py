@@ -132,7 +132,7 @@ class DiffusionModel(nn.Module):
     plan: tuple[int, int]
 
     @property
-    def max_steps(self) -> int:
+    def max_steps(self) -> int | None:
         """Number T of diffusion steps."""
         return len(self.alpha_bar)
 

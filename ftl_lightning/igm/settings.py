@@ -89,7 +89,7 @@ class WeightOptions:
     """Guidance weights: learning, if omega is ``'learned'``, and those of training concepts.
 
     Attributes:
-        initial: initial value of learned weights (the paper draws them from U(0, 1)).
+        initial: initial value of learned weights (the published code draws them from U(0, 1)).
         learning_rate: learning rate of the weights; with the embeddings' rate they collapse.
         scale: final factor of learned weights; a fixed omega is not scaled. If the loss does not reach zero, plans regress
             towards the training distribution; a factor above 1 counters that.

@@ -56,6 +56,27 @@ BC = Method(
 """Goal-conditioned behaviour cloning."""
 
 
+def _regression_model() -> type[Any]:
+    from ftl_lightning.methods.regression import RegressionModel
+
+    return RegressionModel
+
+
+def _regression_pretraining() -> type[Any]:
+    from ftl_lightning.methods.regression import RegressionPretraining
+
+    return RegressionPretraining
+
+
+REGRESSION = Method(
+    name="BC, our network",
+    kind="regression",
+    model=_regression_model,
+    pretraining=_regression_pretraining,
+)
+"""Behaviour cloning with the network, the observation and the training of our model."""
+
+
 def _vae_model() -> type[Any]:
     from ftl_lightning.methods.cvae import VAEModel
 

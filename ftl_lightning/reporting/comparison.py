@@ -8,7 +8,7 @@ import pandas as pd
 from ftl_lightning.domains.comparison import CHOSEN, FINE_TUNED, OURS, PAPERS_METHOD, WITH_MODES, Compared
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.evaluation.results import METHOD, REFERENCE, label, latest
-from ftl_lightning.reporting.paired import Lead, leads, least_certain, same_outcome, signed
+from ftl_lightning.reporting.paired import Lead, leads, least_certain, same_outcome
 from ftl_lightning.reporting.table import (
     MISSING,
     MOST_COLUMNS,
@@ -39,7 +39,6 @@ METHODS = (PAPERS_METHOD, Compared(OURS, CHOSEN), Compared(OURS, WITH_MODES), *m
 ALIKE = 0.9  # minimum share of episodes with our outcome for which a reference policy is annotated
 LINES = 10  # maximum number of lines of the short overview
 MEASURED = ("measured", "spread over seeds")  # columns of a number in the comparison
-OTHER_FORMS = "other forms"  # column of our forms other than the paper's
 
 
 def all_methods(comparison: pd.DataFrame, ablations: pd.DataFrame) -> pd.DataFrame:
@@ -80,7 +79,7 @@ def comparison_table(domain: Domain, results: pd.DataFrame, shown: Sequence[str]
     for setting in settings(domain, rows):
         for metric in shown or metrics(domain):
             method_rows = select(rows, setting=setting, metric=metric)
-            verdicts = {lead.baseline: f"{signed(lead.difference)}, {lead.shown}" for lead in _leads(domain, rows, setting, metric)}
+            verdicts = {lead.baseline: f"{lead.amount}, {lead.shown}" for lead in _leads(domain, rows, setting, metric)}
             for method in methods(rows):
                 if number := summarise(of_method(method_rows, method)):
                     cells = beside_paper(number, lookup(domain, setting, metric, method=method))
@@ -123,7 +122,10 @@ def _leads(domain: Domain, rows: pd.DataFrame, setting: str, metric: str) -> lis
     """Ours against each baseline; for training concepts without language, which equals ours there."""
     trained = setting in training_settings(domain)
     rivals = [method for method in methods(rows) if method.name != OURS and not (method.name == LANGUAGE and trained)]
-    return leads(select(rows, setting=setting, metric=metric), domain.comparison.ours, rivals, domain.less_is_better(metric))
+    tasks = (task for suite in domain.concepts.suites.values() for task in suite.tasks)
+    learned = {task.name: " and ".join(sorted(task.learned)) for task in tasks if task.setting == setting and task.learned}
+    rows = select(rows, setting=setting, metric=metric)
+    return leads(rows, domain.comparison.ours, rivals, learned, domain.less_is_better(metric))
 
 
 def shown_lines(results: pd.DataFrame) -> list[tuple[Domain, str, str]]:
@@ -178,7 +180,7 @@ def overview_tables(results: pd.DataFrame) -> list[Table]:
     """The overview in tables of few columns: the lead and our forms, the other methods, the reference lines."""
     whole = overview(results)
     subject, lead, *columns = whole.cells.columns
-    ours = [name for name in columns if name in (label(*PAPERS_METHOD), OTHER_FORMS)]
+    ours = [name for name in columns if name == label(*PAPERS_METHOD)]
     others = [name for name in columns if name not in ours]
     tables = [Table("overview", whole.caption, whole.cells[[subject, lead, *ours]])]
     step = MOST_COLUMNS - 1
@@ -218,9 +220,8 @@ def headline_tables(domain: Domain, results: pd.DataFrame) -> list[Table]:
 
 
 def _overview(results: pd.DataFrame, lines: Sequence[tuple[Domain, str, str]], columns: Sequence[Compared]) -> Table:
-    forms = [method for method in columns if method.name == OURS and method != PAPERS_METHOD]
-    first = [method for method in columns if method == PAPERS_METHOD]
-    rest = [method for method in columns if method not in (*forms, *first)]
+    ours = sorted((method for method in columns if method.name == OURS), key=lambda method: method != PAPERS_METHOD)
+    rest = [method for method in columns if method not in ours]
     cells = []
     rows_of = {domain.name: compared(domain, results) for domain in _domains(results)}
     for domain, setting, metric in lines:
@@ -230,16 +231,15 @@ def _overview(results: pd.DataFrame, lines: Sequence[tuple[Domain, str, str]], c
         cell_of = {method: _cell(domain, rows, method, setting, metric) for method in columns}
         form = f"{domain.comparison.ours.form}: " if domain.comparison.ours.form and lead else ""
         line = [_subject(domain, setting, metric), MISSING if lead is None else f"{form}{lead}"]
-        line += [cell_of[method] for method in first]
-        if forms:
-            line.append(", ".join(f"{method.form} {cell_of[method]}" for method in forms if cell_of[method] != MISSING) or MISSING)
+        if ours:
+            named = [f"{method.form} {cell_of[method]}".strip() for method in ours if cell_of[method] != MISSING]
+            line.append(", ".join(named) or MISSING)
         cells.append([*line, *(cell_of[method] for method in rest)])
-    head = ["domain: setting, metric", "lead", *(label(*method) for method in first)]
-    head += [OTHER_FORMS] * bool(forms) + [label(*method) for method in rest]
-    ours = f". {label(*PAPERS_METHOD)}: the paper's form of the concept; networks, views and losses are ours" if forms else ""
+    head = ["domain: setting, metric", "lead", *[label(*PAPERS_METHOD)] * bool(ours), *(label(*method) for method in rest)]
+    legend = f". {label(*PAPERS_METHOD)}: first the paper's form of the concept; guidance, networks, views and losses are ours"
     caption = (
         f"Ours and the baselines, mean ± standard error over tasks{_brackets(results)}; lead: by how much ours is better than the "
-        f"best baseline{ours}"
+        f"best baseline, with its 95 % interval over tasks{legend * (len(ours) > 1)}"
     )
     return make_table(None, "overview", caption, cells, head)
 

@@ -1,19 +1,22 @@
-"""Paired tests of two methods, over tasks and seeds or over episodes with the same initial states."""
+"""Paired tests of two methods, over tasks or over episodes with the same initial states."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
-from scipy.stats import binom
+from numpy.typing import NDArray
+from scipy.stats import binom, t
 
 from ftl_lightning.domains.comparison import Compared
 from ftl_lightning.evaluation.results import label
+from ftl_lightning.services.text import counted
 
 LEVEL = 0.05  # significance level of p
 EXACT = 20  # maximum number of differences for the exact test
 DRAWS = 10_000  # number of drawn sign patterns otherwise
+INTERVAL = 4  # minimum number of units for an interval
 ROUNDING = 2e-6  # tolerance for equal means; results have six digits
 AHEAD, BEHIND, UNSHOWN, UNDECIDED = "ahead", "behind", "no difference shown", "undecided"
 SAME = "the same in every task and seed"
@@ -57,15 +60,18 @@ class Lead:
 
     Attributes:
         difference: mean over tasks of means over seeds; positive if ours is better.
-        pairs, same: number of pairs (task, seed) with both methods, and whether all pairs are equal.
-        p: p-value after Holm's correction; ``None`` for too few pairs.
+        units: number of tasks that were compared, or of learned concepts if tasks share them, such as ``'5 tasks'``.
+        p: p-value after Holm's correction; ``None`` for too few units.
+        same: whether both are equal in every task and seed.
+        interval: 95 % interval of the difference over units (Student's t); ``None`` for fewer than :data:`INTERVAL`.
     """
 
     baseline: Compared
     difference: float
-    pairs: int
+    units: str
     p: float | None
     same: bool = False
+    interval: tuple[float, float] | None = None
 
     @property
     def verdict(self) -> str:
@@ -78,14 +84,19 @@ class Lead:
 
     @property
     def shown(self) -> str:
-        """The verdict with p or the number of pairs."""
-        if self.same:
-            return self.verdict
-        because = chance(self.p) if self.p is not None else f"{self.pairs} pair" + "s" * (self.pairs > 1)
-        return f"{self.verdict} ({because})"
+        """The verdict with p or the number of units."""
+        return self.verdict if self.same else f"{self.verdict} ({self.units if self.p is None else chance(self.p)})"
+
+    @property
+    def amount(self) -> str:
+        """The difference, with its interval."""
+        if self.same or self.interval is None:
+            return signed(self.difference)
+        low, high = self.interval
+        return f"{signed(self.difference)} [{low:+.2f}, {high:+.2f}]"
 
     def __str__(self) -> str:
-        return f"{signed(self.difference)} against {label(*self.baseline)}, {self.shown}"
+        return f"{self.amount} against {label(*self.baseline)}, {self.shown}"
 
 
 def signed(difference: float) -> str:
@@ -107,18 +118,20 @@ def chance(p: float) -> str:
     return "p = 1" if p == 1 else f"p = {p:.{3 if p < 0.1 else 2}f}".replace("0.", ".", 1)
 
 
-def leads(rows: pd.DataFrame, ours: Compared, baselines: Sequence[Compared], less: bool = False) -> list[Lead]:
-    """Compare ours with each baseline by a sign-flip permutation test of differences paired by task and seed.
+def leads(
+    rows: pd.DataFrame, ours: Compared, baselines: Sequence[Compared], learned: Mapping[str, str], less: bool = False
+) -> list[Lead]:
+    """Compare ours with each baseline by a sign-flip permutation test over tasks.
 
-    Seeds of a task are not independent tasks. With enough tasks, the signs of whole tasks are flipped, and p generalises to similar
-    tasks. Else the signs of (task, seed) pairs are flipped, and p generalises to new seeds (demonstrations, learning and samples,
-    not the pretrained model) of the same tasks. With too few pairs (a single task and three seeds have p >= .25) there is no
-    verdict. Enough means that p can fall below :data:`LEVEL` after Holm's correction for the number of baselines, which also
+    Seeds of a task are averaged: they are not independent tasks. Tasks that compose the same learned concept are a single unit.
+    The signs of whole units are flipped, so p generalises to similar tasks. With too few units there is no verdict: of five tasks p
+    is .06 at best. Enough means that p can fall below :data:`LEVEL` after Holm's correction for the number of baselines, which also
     covers the choice of the best baseline afterwards.
 
     Args:
         rows: rows of a setting and a metric, with ``task``, ``seed``, ``method``, ``form`` and ``value``.
         baselines: methods to compare with; methods without rows are left out.
+        learned: learned concept by task; a task that is missing is a unit of its own.
         less: whether less is better.
     """
     values = {
@@ -130,25 +143,24 @@ def leads(rows: pd.DataFrame, ours: Compared, baselines: Sequence[Compared], les
         for baseline in baselines
         if {ours, baseline} <= set(values) and not (differences := (values[ours] - values[baseline]).dropna()).empty
     }
-    parts = {baseline: _parts(differences, len(compared)) for baseline, differences in compared.items()}
-    corrected = dict(zip(parts, holm([sign_flip(flipped) for flipped in parts.values()]), strict=True))
-    return [
-        Lead(
-            baseline,
-            difference=float(differences.groupby("task").mean().mean()),
-            pairs=len(differences),
-            p=corrected[baseline] if reachable(len(parts[baseline]), len(compared)) else None,
-            same=bool((differences.abs() <= ROUNDING).all()),
-        )
-        for baseline, differences in compared.items()
-    ]
+    found = []
+    for baseline, differences in compared.items():
+        tasks = differences.groupby("task").mean()
+        parts = (tasks / len(tasks)).groupby([learned.get(task, task) for task in tasks.index]).sum().to_numpy()
+        noun = "task" if len(parts) == len(tasks) else "learned concept"
+        same = bool((differences.abs() <= ROUNDING).all())
+        lead = Lead(baseline, float(tasks.mean()), counted(len(parts), noun), sign_flip(parts.tolist()), same, _interval(parts))
+        found.append((lead, reachable(len(parts), len(compared))))
+    corrected = holm([lead.p or 0.0 for lead, _ in found])
+    return [replace(lead, p=p if enough else None) for (lead, enough), p in zip(found, corrected, strict=True)]
 
 
-def _parts(differences: pd.Series, tests: int) -> list[float]:
-    """Contribution of each task, or else of each pair, to the mean over tasks."""
-    by_task = differences.groupby("task")
-    parts = differences / by_task.transform("size") / by_task.ngroups
-    return list(parts.groupby("task").sum() if reachable(by_task.ngroups, tests) else parts)
+def _interval(parts: NDArray[np.float64]) -> tuple[float, float] | None:
+    """95 % interval of the sum of the contributions of units."""
+    if (count := len(parts)) < INTERVAL:
+        return None
+    half = float(t.ppf(0.975, count - 1) * parts.std(ddof=1) * count**0.5)
+    return float(parts.sum()) - half, float(parts.sum()) + half
 
 
 def least_certain(compared: Sequence[Lead]) -> Lead | None:

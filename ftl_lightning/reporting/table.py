@@ -222,8 +222,8 @@ def lookup(
 
 
 def headlines(domain: Domain, rows: pd.DataFrame) -> list[tuple[str, str]]:
-    """Settings and metrics of short tables: those with numbers of the paper, then the same in closed loop. Without a paper: the
-    first setting of the suite ``paper``, else all settings, each with its decisive metric.
+    """Settings and metrics of short tables: those with numbers of the paper and the headline, closed loop first. Without a paper:
+    the first setting of the suite ``paper``, else all settings, each with its decisive metric.
     """
     measured = set(zip(rows["setting"], rows["metric"], strict=True))
     measured_settings = settings(domain, rows)
@@ -238,4 +238,5 @@ def headlines(domain: Domain, rows: pd.DataFrame) -> list[tuple[str, str]]:
         return [headline for headline in alone if headline in measured]
     reported = [(setting, metric) for setting in measured_settings for metric in metrics(domain) if (setting, metric) in numbers]
     executed = [(setting, domain.comparison.headline) for setting in dict.fromkeys(setting for setting, _ in reported)]
-    return [headline for headline in dict.fromkeys((*reported, *executed)) if headline in measured]
+    found = [headline for headline in dict.fromkeys((*reported, *executed)) if headline in measured]
+    return sorted(found, key=lambda headline: not headline[1].startswith(CLOSED))

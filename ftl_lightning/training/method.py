@@ -83,7 +83,7 @@ def check_present_or_moment(domain: "Domain") -> None:
 
 GROUP = "ftl_lightning.methods"
 """Entry-point group of methods: ``name = package.module:METHOD``."""
-SHIPPED = ("ftl_igm", "bc", "cvae", "in_context", "language", "lora")
+SHIPPED = ("ftl_igm", "bc", "regression", "cvae", "in_context", "language", "lora")
 """This package's methods, in the order of tables; others follow by name."""
 
 

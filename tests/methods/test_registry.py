@@ -18,7 +18,7 @@ from ftl_lightning.training.model_folder import kinds_for, model_class
 from ftl_lightning.training.pretraining import Pretraining
 from tests.conftest import ROOT
 
-KINDS = ["diffusion", "bc", "cvae", "in-context"]
+KINDS = ["diffusion", "bc", "regression", "cvae", "in-context"]
 MODULE = """
 from ftl_lightning.training.method import SHIPPED, Form, Method, kinds, load_method, method_names, method_of, methods
 from ftl_lightning.training.model_folder import kinds_for, model_class
@@ -48,9 +48,9 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(tmp_path)
 
 
-def test_the_six_are_offered_in_the_order_of_tables() -> None:
-    assert SHIPPED == ("ftl_igm", "bc", "cvae", "in_context", "language", "lora")
-    assert method_names()[:6] == SHIPPED
+def test_all_are_offered_in_the_order_of_tables() -> None:
+    assert SHIPPED == ("ftl_igm", "bc", "regression", "cvae", "in_context", "language", "lora")
+    assert method_names()[: len(SHIPPED)] == SHIPPED
     names = [method.name for method in methods()]
     assert len(set(names)) == len(names)
     assert kinds() == KINDS
@@ -60,7 +60,7 @@ def test_the_six_are_offered_in_the_order_of_tables() -> None:
 def test_each_has_its_classes(name: str) -> None:
     method = load_method(name)
     assert issubclass(adaptation_of(method), Adaptation)
-    assert method.configurations in ("conf", f"conf/{name}")
+    assert method.configurations in ("", "conf", f"conf/{name}")
     if method.model is None or method.pretraining is None:
         assert method.kind == "diffusion"
     else:
@@ -78,8 +78,8 @@ def test_a_kind_that_no_package_offers_has_no_model() -> None:
 @pytest.mark.parametrize(
     ("adaptation", "expected"),
     [
-        (InversionModule, ["diffusion", "bc", "cvae"]),
-        (FineTuning, ["diffusion", "bc", "cvae"]),  # what it is derived from adapts these
+        (InversionModule, ["diffusion", "bc", "regression", "cvae"]),
+        (FineTuning, ["diffusion", "bc", "regression", "cvae"]),  # what it is derived from adapts these
         (LanguageAdaptation, ["diffusion"]),
         (LearnerAdaptation, ["in-context"]),
     ],
@@ -104,7 +104,7 @@ def test_a_package_of_ones_own_offers_a_method_beside_ours_and_never_in_place_of
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("chess", r"method: expected one of ftl_igm, bc, cvae, in_context, language, lora, absent, .*, found 'chess'"),
+        ("chess", r"method: expected one of ftl_igm, bc, regression, cvae, in_context, language, lora, absent, .*, found 'chess'"),
         ("absent", r"method 'absent': cannot be imported \(ModuleNotFoundError: No module named 'not_installed_anywhere'\); mend"),
         ("nameless", r"method 'nameless': cannot be imported \(AttributeError: .*has no attribute 'OTHER'\); mend its package"),
         ("text", "method 'text': expected a Method, found str; mend its package"),

@@ -32,15 +32,20 @@ State = Literal["queued", "running", "again", "done", "failed"]
 
 @dataclass(frozen=True)
 class Outcome:
-    """Result of a cell: rows (or ``None``), note, single-line error if it failed, seconds (0 if nothing was run), and machine."""
+    """Result of a cell: rows (or ``None``), note, single-line error if it failed, seconds (0 if nothing was run), and machine;
+    hash of its settings, and configuration hash of its rows.
+    """
 
     rows: "pd.DataFrame | None" = None
     note: str = ""
     error: str = ""
     seconds: float = 0.0
     node: str = ""
+    settings: str = ""
+    config_hash: str = ""
 
 
+_NOTHING = Outcome()
 Tell = Callable[[Cell, State, str, str], None]  #: Callback for a new state of a cell, with machine and note.
 Run = Callable[[Sequence[Cell], set[str], Tell], Iterator[tuple[Cell, Outcome]]]
 """Runs cells, given the configuration hashes that need not run; yields each cell with its outcome."""
@@ -51,7 +56,8 @@ Attempt = Callable[[Cell, set[str], bool], Outcome]
 @dataclass(frozen=True)
 class CellRecord:
     """Recorded state of a cell, with configuration files, last machine, attempts by the last command, and outcome or error.
-    ``seconds`` is the duration of the last complete run; 0 for none.
+    ``seconds`` is the duration of the last complete run; 0 for none. ``config_hash`` is that of its rows, if it has any;
+    ``settings`` then is the hash of its options, defaults included, and of the pretraining of its model.
     """
 
     state: State = "queued"
@@ -60,6 +66,8 @@ class CellRecord:
     runs: int = 0
     seconds: float = 0.0
     note: str = ""
+    settings: str = ""
+    config_hash: str = ""
 
 
 def record_path(results: str | Path) -> Path:
@@ -80,8 +88,8 @@ def read_record(results: str | Path) -> dict[str, CellRecord]:
         return entries
 
 
-def tell(results: str | Path, cells: Sequence[Cell], state: State, node: str = "", note: str = "", seconds: float = 0.0) -> None:
-    """Record a state of cells; an empty node and 0 seconds keep the recorded values. Processes write in turn."""
+def tell(results: str | Path, cells: Sequence[Cell], state: State, outcome: Outcome = _NOTHING) -> None:
+    """Record a state of cells; what is empty in the outcome keeps its recorded value. Processes write in turn."""
     path = record_path(results)
     with alone(path.parent):
         entries = read_record(results)
@@ -90,10 +98,12 @@ def tell(results: str | Path, cells: Sequence[Cell], state: State, node: str = "
             entries[cell.name] = CellRecord(
                 state=state,
                 configs=cell.configs,
-                node=node or ("" if state == "queued" else before.node),
+                node=outcome.node or ("" if state == "queued" else before.node),
                 runs=0 if state == "queued" else before.runs + (state == "running"),
-                seconds=round(seconds, 2) or before.seconds,
-                note=line(note),
+                seconds=round(outcome.seconds, 2) or before.seconds,
+                note=line(outcome.error or outcome.note),
+                settings=outcome.settings or before.settings,
+                config_hash=outcome.config_hash or before.config_hash,
             )
         content = {"kind": KIND, "format": FORMAT, "cells": {name: asdict(entry) for name, entry in entries.items()}}
         write_text(path, json.dumps(content, indent=1, ensure_ascii=False) + "\n")

@@ -1,6 +1,7 @@
 """Check a plan, and run it cell by cell, here or on a cluster."""
 
 import importlib
+import itertools
 import socket
 import tempfile
 import time
@@ -15,12 +16,25 @@ from typing import TYPE_CHECKING, Literal
 
 from ftl_lightning.apps.ablation.cluster import cluster
 from ftl_lightning.apps.ablation.plan import Cell, Stage
-from ftl_lightning.apps.ablation.record import Outcome, Run, State, Tell, by_node, count_states, estimate, read_record, table, tell
+from ftl_lightning.apps.ablation.record import (
+    CellRecord,
+    Outcome,
+    Run,
+    State,
+    Tell,
+    by_node,
+    count_states,
+    estimate,
+    read_record,
+    table,
+    tell,
+)
 from ftl_lightning.services import log_folder
 from ftl_lightning.services.configuration import load
 from ftl_lightning.services.errors import UserError, require
 from ftl_lightning.services.progress import bar
 from ftl_lightning.services.shipped import pretrained_folder
+from ftl_lightning.services.tensor_file import content_hash
 from ftl_lightning.services.text import say
 from ftl_lightning.services.trust import check_module
 
@@ -31,6 +45,8 @@ if TYPE_CHECKING:
 
 MOST_SEEDS = 1000
 """Maximum number of seeds of an ablation."""
+IN_RESULTS = "in the results already"
+"""Note of a cell that need not be run."""
 
 
 def check(cells: Sequence[Cell]) -> None:
@@ -100,26 +116,27 @@ def run_ablation(
 
     all_cells = [cell for cells in plan for cell in cells]
     check(all_cells)
-    read_record(results)  # fails early if damaged
+    known_outcomes, fits = outcomes(plan, results), _fits(plan)
     total, number, failed = len(all_cells), 0, []
     start = time.monotonic()
     noted = partial(tell, results)
     states: dict[str, State] = {cell.name: "queued" for cell in all_cells}
 
     def record_state(cell: Cell, state: State, node: str, note: str) -> None:
-        noted([cell], state, node, note)
+        noted([cell], state, Outcome(note=note, node=node))
         states[cell.name] = state
         advance(0, count_states(list(states.values())))
         if state == "again":
             say(f"{cell}: runs again, lost on {node or 'its machine'}: {note}")
 
     with (
-        _executor(executor, address, [cell for cell in all_cells if not _is_made(cell)]) as run,
+        _executor(executor, address, [cell for cells in to_run(known_outcomes) for cell in cells]) as run,
         bar("cells", total, lines=False) as advance,
     ):
         noted(all_cells, "queued")
-        for cells in plan:
-            for cell, outcome in run(cells, known_hashes(results), record_state):
+        for stage, needed in zip(known_outcomes, to_run(known_outcomes), strict=True):
+            skipped = ((cell, outcome) for cell, outcome in stage if outcome is not None)
+            for cell, outcome in itertools.chain(skipped, run(needed, known_hashes(results), record_state)):
                 number += 1
                 minutes = (time.monotonic() - start) / number * (total - number) / 60
                 note = f"failed: {outcome.error}\n  {cell.command}" if outcome.error else outcome.note
@@ -129,7 +146,9 @@ def run_ablation(
                 if outcome.error:
                     failed.append(f"{cell}: {outcome.error}")
                 states[cell.name] = "failed" if outcome.error else "done"
-                noted([cell], states[cell.name], outcome.node, outcome.error or outcome.note, outcome.seconds)
+                if outcome.config_hash:
+                    outcome = replace(outcome, settings=settings_of(cell, fits))
+                noted([cell], states[cell.name], outcome)
                 advance(1, count_states(list(states.values())))
     if failed or executor == "ray":
         show_cells(results, all_cells)
@@ -165,17 +184,36 @@ def planned(stages: Sequence[Stage], seeds: Sequence[int], root: str = "", only:
 
 def show_estimate(plan: Sequence[Sequence[Cell]], results: str, workers: int = 0) -> None:
     """Check the cells of each stage; print how many are to run, and the estimated hours for some workers (0: several numbers)."""
-    total = sum(map(len, plan))
     check([cell for cells in plan for cell in cells])
-    known = known_hashes(results)
-    with bar("cells looked at", total, lines=False) as advance:
+    say("\n".join(estimate(to_run(outcomes(plan, results)), read_record(results), sum(map(len, plan)), workers)))
 
-        def needed(cell: Cell) -> bool:
-            advance()
-            return not _is_done(cell, known)
 
-        to_run = [[cell for cell in cells if needed(cell)] for cells in plan]
-    say("\n".join(estimate(to_run, read_record(results), total, workers)))
+def outcomes(plan: Sequence[Sequence[Cell]], results: str) -> list[list[tuple[Cell, Outcome | None]]]:
+    """The cells of each stage with the outcome of an earlier run; ``None`` if a cell must run. A pretraining whose model is missing
+    must run if a cell of the plan that must run reads the model, or if no cell of the plan reads it.
+    """
+    known, record, fits = known_hashes(results), read_record(results), _fits(plan)
+    found: list[list[tuple[Cell, Outcome | None]]] = []
+    read: dict[str, bool] = {}  # by folder of a model: whether a cell that must run reads it
+    with bar("cells looked at", sum(map(len, plan)), lines=False) as advance:
+        for cells in reversed(plan):
+            found.insert(0, [])
+            for cell in cells:
+                if cell.verb == "fit":
+                    again = not _is_made(cell) and read.get(cell.options.get("model.output", ""), True)
+                    outcome = None if again else Outcome(note="done before")
+                else:
+                    outcome = _before(cell, known, record, fits)
+                    model = cell.options.get("model.pretrained", "")
+                    read[model] = outcome is None or read.get(model, False)
+                found[0].append((cell, outcome))
+                advance()
+    return found
+
+
+def to_run(found: Sequence[Sequence[tuple[Cell, Outcome | None]]]) -> list[list[Cell]]:
+    """The cells of each stage of :func:`outcomes` that must run."""
+    return [[cell for cell, outcome in stage if outcome is None] for stage in found]
 
 
 def _is_made(cell: Cell) -> bool:
@@ -183,17 +221,41 @@ def _is_made(cell: Cell) -> bool:
     return bool(cell.done) and Path(cell.done).is_file()
 
 
-def _is_done(cell: Cell, known: set[str]) -> bool:
-    """Whether a cell need not run; a cell whose pretrained model is missing must run."""
+def _before(cell: Cell, known: set[str], record: Mapping[str, CellRecord], fits: Mapping[str, Cell]) -> Outcome | None:
+    """Outcome of an inversion whose rows are in the results. The hash of its configuration contains that of the pretrained model;
+    where the model is missing, the record of a run with the same settings decides.
+    """
     if _is_made(cell):
-        return True
-    if cell.verb == "fit" or not known:
-        return False
+        return Outcome(note="done before")
+    if not known:
+        return None
+    entry = record.get(cell.name, CellRecord())
+    if entry.config_hash in known and entry.settings == settings_of(cell, fits):
+        return Outcome(note=IN_RESULTS)
     from ftl_lightning.apps.lightning_cli import build
 
     with log_folder.run(), suppress(UserError, ArgumentError):
-        return _hash(build(cell.verb, [*cell.arguments, *_log(cell)])) in known
-    return False
+        found = _hash(build(cell.verb, [*cell.arguments, *_log(cell)]))
+        return Outcome(note=IN_RESULTS, config_hash=found) if found in known else None
+    return None
+
+
+def _fits(plan: Sequence[Sequence[Cell]]) -> dict[str, Cell]:
+    """The pretrainings of a plan by the folder of their model."""
+    return {cell.options.get("model.output", ""): cell for cells in plan for cell in cells if cell.verb == "fit"}
+
+
+def settings_of(cell: Cell, fits: Mapping[str, Cell]) -> str:
+    """Hash of the values of all options of a cell but the folder of recordings, and of the pretraining of its model if that is part
+    of the plan.
+    """
+    from ftl_lightning.apps.lightning_cli import parse
+
+    fit = fits.get(cell.options.get("model.pretrained", "")) if cell.verb == "invert" else None
+    values = [parse(one.verb, one.arguments) for one in (cell, fit) if one]
+    for options in values:
+        options["data"]["init_args"].pop("root", None)
+    return content_hash(values)
 
 
 def show_cells(results: str, cells: Sequence[Cell]) -> None:
@@ -237,7 +299,7 @@ def attempt(cell: Cell, known: set[str], again: bool = False) -> Outcome:
         try:
             line = build(cell.verb, [*cell.arguments, *_log(cell), f"--evaluation.results={path}"])
             if cell.verb == "invert" and _hash(line) in known:
-                return Outcome(note="in the results already")
+                return Outcome(note=IN_RESULTS, config_hash=_hash(line))
             start = time.monotonic()
             more = {"ckpt_path": last_checkpoint(line.trainer)} if again and cell.verb == "fit" else {}
             getattr(line.trainer, cell.verb)(line.model, datamodule=line.datamodule, **more)
@@ -248,7 +310,8 @@ def attempt(cell: Cell, known: set[str], again: bool = False) -> Outcome:
             return Outcome(error=repr(error))
         rows = read_rows(path) if path.is_file() else None
         seconds = time.monotonic() - start
-    return Outcome(rows, "done" if rows is None else f"{len(rows)} rows", seconds=seconds)
+    note, config_hash = ("done", "") if rows is None else (f"{len(rows)} rows", rows["config_hash"].iloc[0])
+    return Outcome(rows, note, seconds=seconds, config_hash=config_hash)
 
 
 def _log(cell: Cell) -> list[str]:

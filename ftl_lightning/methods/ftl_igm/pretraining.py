@@ -136,6 +136,7 @@ class PretrainingModule(Pretraining[GenerativeModel]):
 
     flat = PRETRAINING
     framed = True
+    network: type[GenerativeModel] = GenerativeModel
 
     def __init__(
         self,
@@ -161,8 +162,8 @@ class PretrainingModule(Pretraining[GenerativeModel]):
         self.loss, self.codes, self.draws = loss, codes, draws
 
     def build(self, prepared: Prepared[ModelConfig], data: PretrainingData) -> GenerativeModel:
-        network = {name: self.hparams[name] for name in ("denoiser", "diffusion_steps", "prediction")}
-        model = GenerativeModel(prepared.configured(DiffusionConfig, denoiser_args=self.denoiser_args, **network))
+        named = {name: self.hparams[name] for name in ("denoiser", "diffusion_steps", "prediction")}
+        model = self.network(prepared.configured(DiffusionConfig, denoiser_args=self.denoiser_args, **named))
         if isinstance(model.denoiser, Prediction) and model.denoiser.spectrum is not None:
             windows = data.some_windows(WINDOWS)
             frames = None if model.frames is None else model.frames[windows.concepts]

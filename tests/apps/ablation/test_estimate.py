@@ -4,8 +4,9 @@ from pathlib import Path
 
 import pytest
 
+from ftl_lightning.apps.ablation import run
 from ftl_lightning.apps.ablation.plan import Cell, Stage
-from ftl_lightning.apps.ablation.record import CellRecord, estimate, makespan, read_record, record_path, seconds_of, tell
+from ftl_lightning.apps.ablation.record import CellRecord, Outcome, estimate, makespan, read_record, record_path, seconds_of, tell
 from ftl_lightning.cli.main import main
 from ftl_lightning.services.errors import UserError
 from tests.apps.ablation.attempts import nothing_is_run  # noqa: F401
@@ -54,13 +55,14 @@ def test_an_estimate_says_what_it_does_not_know() -> None:
 def test_the_record_keeps_what_was_measured_and_refuses_what_it_did_not_write(tmp_path: Path) -> None:
     one, other = cells(0)
     tell("r.csv", [one, other], "queued")
-    told = (("running", "n1"), ("again", "n1", "lost\nits node"), ("running", "n2"), ("done", "", "4 rows", 12.345))
-    for state in told:
-        tell("r.csv", [one], *state)
-    entry = CellRecord("done", ("a.yaml",), "n2", 2, 12.35, "4 rows")
+    tell("r.csv", [one], "running", Outcome(node="n1"))
+    tell("r.csv", [one], "again", Outcome(node="n1", note="lost\nits node"))
+    tell("r.csv", [one], "running", Outcome(node="n2"))
+    tell("r.csv", [one], "done", Outcome(note="4 rows", seconds=12.345, settings="1:a", config_hash="2:b"))
+    entry = CellRecord("done", ("a.yaml",), "n2", 2, 12.35, "4 rows", "1:a", "2:b")
     assert read_record("r.csv") == {one.name: entry, other.name: CellRecord("queued", ("a.yaml",))}
     tell("r.csv", [one], "queued")
-    assert read_record("r.csv")[one.name] == CellRecord("queued", ("a.yaml",), seconds=12.35)
+    assert read_record("r.csv")[one.name] == CellRecord("queued", ("a.yaml",), seconds=12.35, settings="1:a", config_hash="2:b")
     record_path("r.csv").write_text('{"kind": "cells of an ablation", "format": 2, "cells": {}}')
     with pytest.raises(UserError, match=r"r.cells.json: expected cells of an ablation of format 1, found another file; remove it"):
         read_record("r.csv")
@@ -92,3 +94,25 @@ def test_a_grid_is_shown_in_one_table_and_estimated_from_its_own_cells(tmp_path:
     assert "measured: 0 of them before, 2 estimated from other seeds or options of the same files" in told
     assert "2 at a time: " in told
     assert "1 at a time: " not in told
+
+
+def test_what_was_measured_is_known_without_the_models(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In another checkout pretrained models are missing: rows and the record of their settings decide."""
+    fit = next(Stage("fit", "a.yaml", options={"model.output": "logs/m"}, done="logs/m/config.json").cells(0))
+    reads, other = (next(Stage("invert", "a.yaml", name=name, options={"model.pretrained": "logs/m"}).cells(0)) for name in "ab")
+    plan = [[fit], [reads, other]]
+    monkeypatch.setattr(run, "settings_of", lambda cell, fits: f"settings of {cell.name}")
+    monkeypatch.setattr(run, "known_hashes", lambda results: {"2:a", "2:b"})
+
+    def measured(cell: Cell, config_hash: str) -> None:
+        tell("r.csv", [cell], "done", Outcome(settings=f"settings of {cell.name}", config_hash=config_hash))
+
+    measured(reads, "2:a")
+    assert run.to_run(run.outcomes(plan, "r.csv")) == [[fit], [other]]
+    measured(other, "2:c")
+    assert run.to_run(run.outcomes(plan, "r.csv")) == [[fit], [other]]
+    measured(other, "2:b")
+    assert run.to_run(run.outcomes(plan, "r.csv")) == [[], []]
+    assert run.to_run(run.outcomes([[fit]], "r.csv")) == [[fit]]
+    monkeypatch.setattr(run, "settings_of", lambda cell, fits: "changed")
+    assert run.to_run(run.outcomes(plan, "r.csv")) == plan
