@@ -41,6 +41,8 @@ TUNED = {
     "tuning_fold": "five, every 2 steps, after 40 tasks",
 }
 """Rows of settings that were tried, and what they have in common."""
+TEMPERATURES = (0.5, 1.0)
+"""Temperatures of our model in the order of ``conf/tuning_few.yaml``."""
 
 
 def number(value: float) -> str:
@@ -115,16 +117,18 @@ def paired(rows: pd.DataFrame, tuned: Collection[str]) -> str:
 
 
 def tuning(folder: Path) -> str:
-    """Settings of every method on the validation tasks, by the names of the cells that ``ablate`` recorded."""
+    """Settings of every method on the validation tasks."""
     lines = []
     for name, means in TUNED.items():
+        tried: dict[tuple[str, str], int] = {}
         rows = read(folder / f"{name}.csv")
-        for cell, entry in json.loads((folder / f"{name}.cells.json").read_text("utf-8"))["cells"].items():
-            part = rows[rows["config_hash"] == entry["config_hash"]]
-            if len(part):
-                _, *settings, _ = cell.split(", ")
-                method = f"{part['method'].iloc[0]} {part['form'].iloc[0]}".strip()
-                lines.append([means, method, ", ".join(settings), number(float(part["value"].mean()))])
+        rows = rows.assign(called=[f"{method} {form}".strip() for method, form in zip(rows["method"], rows["form"], strict=True)])
+        for (called, variant, omega, _), part in rows.groupby(["called", "variant", "omega", "config_hash"], sort=False):
+            setting = f"{variant}, omega {omega}" if omega != "none" else str(variant)
+            before = tried[str(called), setting] = tried.get((str(called), setting), -1) + 1
+            if name == "tuning_few" and called in ("FTL-IGM with adapter", "LoRA fine-tuning"):
+                setting += f", temperature {TEMPERATURES[before]:g}"
+            lines.append([means, str(called), setting, number(float(part["value"].mean()))])
     return table(["demonstrations, plans", "method", "setting", "success on the validation tasks"], lines)
 
 
