@@ -56,7 +56,7 @@ class LanguageAdaptation(Adaptation):
 
     @classmethod
     def adapts(cls, model: type[ConceptModel]) -> bool:
-        return issubclass(model, GenerativeModel)
+        return model is GenerativeModel  # of a regression with its network the row would be another method's
 
     def _embedding(self, goal: str) -> Tensor:
         """Embed a task's description, ``(1, 1, n)``."""
