@@ -104,9 +104,9 @@ def paired(rows: pd.DataFrame, tuned: Collection[str]) -> str:
     groups = {"test tasks": new[~left], "left out in turn": new[left], "and not tuned on": new[left & ~new["task"].isin(tuned)]}
     lines = []
     for group, part in groups.items():
-        ours = of(part, OURS).groupby("task")["value"].mean()
-        others = {name: of(part, name).groupby("task")["value"].mean() for name in METHODS if name != OURS}
-        apart = {name: (ours - other).dropna() for name, other in others.items()}
+        means = {name: of(part, name).groupby(["task", "seed"])["value"].mean() for name in METHODS}
+        others = {name: other for name, other in means.items() if name != OURS}
+        apart = {name: (means[OURS] - other).dropna().groupby("task").mean() for name, other in others.items()}  # seeds of both
         apart = {name: differences for name, differences in apart.items() if len(differences)}
         p_values = holm([sign_flip((differences / len(differences)).tolist()) for differences in apart.values()])
         for (name, differences), p in zip(apart.items(), p_values, strict=True):
