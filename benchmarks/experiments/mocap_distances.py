@@ -43,7 +43,7 @@ from ftl_lightning.training.model_folder import load_model
 ENOUGH = MOST = 500
 """Windows on each side, where there are as many: above, distances depend more on motion than on the number of windows."""
 SAMPLING = Sampling("dpm_solver", 10, 1.0)
-"""As conf/sampling/mocap.yaml."""
+"""As conf/sampling/diverse.yaml."""
 STARTS, EACH = 20, 10
 """Starts from which variation is measured, and samples from each."""
 FEWEST = 50
