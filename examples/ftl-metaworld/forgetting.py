@@ -2,6 +2,8 @@
 
     python forgetting.py
 
+Methods that the file has are not measured again.
+
 Concepts are those of ``conf/table.yaml``, seed 0. After each of the five test tasks, five episodes of each training task,
 with the learned concept at weight 0. Ours leaves the network as it is. LoRA and full fine-tuning change it for all concepts.
 """
@@ -33,9 +35,11 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=HERE / "results" / "forgetting.json")
     out: Path = parser.parse_args().out
     torch.set_num_threads(1)
-    rates: dict[str, dict[str, float]] = {}
+    rates: dict[str, dict[str, float]] = json.loads(out.read_text("utf-8")) if out.is_file() else {}
     before: dict[str, float] = {}
     for method, ((folder, settings), cell) in METHODS.items():
+        if method in rates:
+            continue
         model = FewShot.from_pretrained(HERE / folder, settings=HERE / settings)
         starts = {text: model.starts(text, EPISODES, seed=1) for text in model.training_concepts}
 

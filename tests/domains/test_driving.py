@@ -16,6 +16,7 @@ from ftl_lightning.domains.driving.scenarios import SCENARIOS, advance, arrived,
 from ftl_lightning.domains.driving.traffic import (
     NAMES,
     OBSERVED,
+    RULES,
     SCENARIO,
     SCENE,
     STEP,
@@ -332,3 +333,52 @@ def test_after_an_episode_every_vehicle_drives_straight_on(name: str, seconds: f
     assert longer[2:, 0, 2].tolist() == [20 - 2 * seconds * k for k in (1, 2, 3)]
     assert (longer[2:, :2, 3:] == seen[-1, :2, 3:]).all()
     assert (longer[2:, 2:] == 0).all()
+
+
+def final(name: str, decide: Any, seed: int) -> Any:
+    """Environment after an episode of decisions by name; ``decide`` maps an environment to a decision."""
+    env = make(name)
+    env.reset(seed=seed)
+    while not advance(env, env.action_type.actions_indexes[decide(env)])[1]:
+        pass
+    return env
+
+
+def test_a_red_light_is_passed_when_it_is_green_and_otherwise_passing_is_an_offence() -> None:
+    colours = set()
+    for seed in range(8):
+        env = final("red light", lambda env: "FASTER", seed)
+        assert env.vehicle.offence == (env.green > 0) == (not arrived(env, "red light"))
+        waited = final(
+            "red light", lambda env: "SLOWER" if env.time < env.green and env.vehicle.position[0] > env.line - 25 else "IDLE", seed
+        )
+        assert not waited.vehicle.offence
+        colours.add(env.green > 0)
+    assert colours == {False, True}
+
+
+def test_signs_are_observed_as_standing_vehicles_and_do_not_collide() -> None:
+    env = next(env for env in (start("red light", seed) for seed in range(20)) if env.green > 0)  # type: ignore[attr-defined]
+    seen = observe(env)  # type: ignore[arg-type]
+    at_line = seen[:, 0] * (abs(seen[:, 1] - env.line) < 1e-4)  # type: ignore[attr-defined]
+    assert at_line.sum() >= 1
+    assert (seen[at_line > 0, 3:5] == 0).all()
+    through = final("give way", lambda env: "FASTER", 3)
+    assert through.vehicle.offence or not through.vehicle.crashed
+
+
+def test_to_enter_a_column_of_vehicles_without_a_gap_is_an_offence_and_an_overtaker_returns_to_its_lane() -> None:
+    assert any(final("ramp", lambda env: "LANE_LEFT", seed).vehicle.offence for seed in range(4))
+    env = start("overtake")
+    env.vehicle.position = np.array([env.leader.position[0] + 20, 0.0])  # type: ignore[attr-defined]
+    env.vehicle.on_state_update()  # type: ignore[attr-defined]
+    assert not arrived(env, "overtake")  # type: ignore[arg-type]
+    env.vehicle.position = np.array([env.leader.position[0] + 20, 4.0])  # type: ignore[attr-defined]
+    env.vehicle.on_state_update()  # type: ignore[attr-defined]
+    assert arrived(env, "overtake")  # type: ignore[arg-type]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", RULES)
+def test_the_expert_keeps_the_rules(name: str) -> None:
+    assert all(expert.drive(name, seed)[1] for seed in range(2))

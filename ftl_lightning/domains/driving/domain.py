@@ -212,7 +212,12 @@ DOMAIN = Domain(
     concepts=Concepts(
         training=traffic.TRAINING_CONCEPTS,
         suites=traffic.SUITES,
-        descriptions=(*traffic.TRAINING_CONCEPTS, "roundabout", "roundabout third exit"),  # other scenarios use these concepts
+        descriptions=(
+            *traffic.TRAINING_CONCEPTS,
+            "roundabout",
+            "roundabout third exit",
+            *traffic.RULES,
+        ),  # other scenarios use these concepts
         reads=traffic.NAMES.__contains__,
         table=Path(__file__).parent / "embeddings.safetensors",
     ),

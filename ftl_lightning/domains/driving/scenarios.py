@@ -20,6 +20,7 @@ from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.objects import RoadObject
 from numpy.typing import NDArray
 
+from ftl_lightning.domains.driving import rules
 from ftl_lightning.domains.driving.fast import FastVehicle, accelerate
 from ftl_lightning.domains.driving.traffic import FEATURES, VEHICLES, check_scenario
 
@@ -110,6 +111,22 @@ class ThirdExit(Roundabout):
         self.vehicle.plan_route_to("wxs")
 
 
+class RedLight(_Accelerated, rules.RedLight):
+    """Red light in the faster classes."""
+
+
+class GiveWay(_Accelerated, rules.GiveWay):
+    """Stream with priority in the faster classes."""
+
+
+class Ramp(_Accelerated, rules.Ramp):
+    """Ramp in the faster classes."""
+
+
+class Overtake(_Accelerated, rules.Overtake):
+    """Two-way road in the faster classes."""
+
+
 @dataclass(frozen=True)
 class Scenario:
     """Driving scenario.
@@ -145,6 +162,10 @@ def _other_roundabout(radius: int, lanes: int, vehicles: int) -> Scenario:
     return Scenario(OtherRoundabout, config, _SECOND_EXIT, destinations=(*EXITS, "wxr"))
 
 
+def _ruled(environment: type[rules.Street]) -> Scenario:
+    return Scenario(environment, {}, lambda env: env.arrived() and not env.vehicle.offence)
+
+
 _SECOND_EXIT = _on(("nx", "nxs"), ("nxs", "nxr"))
 SCENARIOS = {
     "highway": Scenario(Highway, {"duration": 10}, lambda env: bool(env.time >= env.config["duration"])),
@@ -176,6 +197,10 @@ SCENARIOS = {
     "roundabout third exit": Scenario(ThirdExit, {"duration": 10}, _on(("wx", "wxs"), ("wxs", "wxr")), destinations=EXITS),
     "roundabout of three lanes": _other_roundabout(radius=28, lanes=3, vehicles=7),
     "roundabout of one lane": _other_roundabout(radius=16, lanes=1, vehicles=4),
+    "red light": _ruled(RedLight),
+    "give way": _ruled(GiveWay),
+    "ramp": _ruled(Ramp),
+    "overtake": _ruled(Overtake),
 }
 
 
