@@ -21,7 +21,7 @@ FOLDER = ROOT / "docs" / "claims"
 NUMBER = re.compile(r"(?<![\w.])(?<!\d,)-?(?:\d{1,3}(?:,\d{3})+|\d+)?(?:\.\d+|(?<=\d))(?!\d|\.\d|,\d{3})")
 """A number, such as ``1,000``, ``-0.5`` or ``.96``; no part of a name or of a version of three parts."""
 UNREAD = (
-    r"<!-- (\w+): begin.*?<!-- \1: end",  # generated, and compared by tests of their own
+    r"<!-- (\w+): begin.*?<!-- \1: end",  # compared by tests of their own, or noted by hand, as the page says
     r"^( *)(`{3,}|~{3,})[^\n]*\n.*?^ *\3`*$",  # code, included files
     r"(?<=\n\n)(?: {4}[^\n]*\n+)+",  # indented code
     r"(`+)(?!`)(?:(?!\n\n).)*?(?<!`)\4(?!`)",
@@ -32,10 +32,10 @@ PATTERN = re.compile("|".join(UNREAD), re.DOTALL | re.MULTILINE)
 
 
 def pages() -> list[Path]:
-    """All pages whose numbers are tied: of trials alone, and of the page that is generated, they are not."""
+    """All pages whose numbers are tied to sources; the page of the paper is generated."""
     docs = [*(ROOT / "docs").glob("*.md"), *(ROOT / "docs" / "domains").glob("*.md")]
-    told = [page for page in docs if not page.name.startswith("experiments") and page.name != "paper.md"]
-    return [ROOT / "README.md", *sorted(told), *sorted(ROOT.glob("pretrained/*/README.md"))]
+    tied = [page for page in docs if page.name != "paper.md"]
+    return [ROOT / "README.md", *sorted(tied), *sorted(ROOT.glob("pretrained/*/README.md"))]
 
 
 def claims_of(page: Path) -> Path:

@@ -171,7 +171,7 @@ def test_pages_tell_the_numbers_of_strokes() -> None:
     }
     told = f"new kinds {rates[0]} with hashing and {rates[1]} with MiniLM; "
     told += ", ".join(f"{name} {one} and {other}" for name, (one, other) in looks.items())
-    assert told in (ROOT / "docs" / "experiments-own-data.md").read_text(encoding="utf-8")
+    assert told in (ROOT / "docs" / "findings.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(
@@ -240,7 +240,7 @@ def test_the_page_of_the_paper_says_what_has_no_rows() -> None:
 def test_the_notes_tell_how_well_the_judge_of_motion_recognises_unseen_people() -> None:
     content = json.loads((ROOT / "results" / "mocap_judge.json").read_text(encoding="utf-8"))
     runs = content["across people"]
-    notes = (ROOT / "docs" / "experiments-mocap.md").read_text(encoding="utf-8")
+    notes = (ROOT / "docs" / "tables.md").read_text(encoding="utf-8")
     cells = []
     for key in ("balanced accuracy", "of the tested classes alone"):
         shares = [run["whole together"][key] for run in runs]

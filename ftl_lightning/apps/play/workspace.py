@@ -30,7 +30,7 @@ FIRST, INTERVAL, RATIO = 0.2, 0.5, 3.0
 """Seconds of learning before the first samples, minimum seconds between samples, minimum ratio of learning to sampling time."""
 REPORT = 0.05  # minimum seconds between reported losses: each report takes time from learning
 QUICK: Mapping[str, Any] = {"form": PAPER, "samples": 16, "learning_rate": 0.3}
-QUICK_STEPS = 250  # steps of quick learning from a user's data; chosen on strokes, see docs/experiments-own-data.md
+QUICK_STEPS = 250  # steps of quick learning from a user's data; chosen on strokes, see docs/findings.md#own-data
 
 Tell = Callable[[Json], None]
 R = TypeVar("R")

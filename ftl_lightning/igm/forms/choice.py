@@ -51,7 +51,7 @@ TOLERANCE = 0.01
 OWN, BOTH, ALL = 0.8, 2.03, 3.27
 """One set suffices if its relative training loss is at most the first value; or if the sum of training and leave-one-out losses is
 at most the second, or with sets in the span, the sum including the span's leave-one-out loss at most the third. Chosen on relations
-not seen in pretraining, see docs/experiments-forms.md.
+not seen in pretraining, see docs/findings.md#own-data.
 """
 NARROW, WIDE = 0.65, 0.75
 """Spread of samples, relative to demonstrations: below the first value mixtures replace one set; mixtures above the second are
