@@ -1,6 +1,6 @@
 """Measures of generated motion: kinematic rules of actions, the judge, and naturalness.
 
-Rules need no training and are calibrated on recordings (docs/findings.md#human-motion): a second opinion beside the judge. Metrics map
+Rules need no training and are calibrated on recordings: a second opinion beside the judge. Metrics map
 ``(goal, states (sample, 32, 42), initial states or None) -> (sample,)``.
 """
 
