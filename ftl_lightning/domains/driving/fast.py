@@ -229,15 +229,18 @@ class FastRoad(Road):
     def step(self, dt: float) -> None:
         for vehicle in self.vehicles:
             vehicle.step(dt)
-        x, y = np.array([v.position for v in self.vehicles]).T
-        reach = max(v.diagonal for v in self.vehicles) + max(abs(v.speed) for v in self.vehicles) * dt
-        near = (np.abs(x[:, None] - x) <= reach) & (np.abs(y[:, None] - y) <= reach)
-        pairs = np.argwhere(np.triu(near, 1)).tolist()[::-1]
-        for i, vehicle in enumerate(self.vehicles):
-            while pairs and pairs[-1][0] == i:
-                vehicle.handle_collisions(self.vehicles[pairs.pop()[1]], dt)
-            for thing in self.objects:
-                vehicle.handle_collisions(thing, dt)
+        places = [vehicle.position.tolist() for vehicle in self.vehicles]
+        sizes = [float(vehicle.diagonal) for vehicle in self.vehicles]
+        things = [(thing, thing.position.tolist(), float(thing.diagonal)) for thing in self.objects]
+        for i, (vehicle, (x, y), size) in enumerate(zip(self.vehicles, places, sizes, strict=True)):
+            # As in RoadObject._is_colliding, with a margin for rounding: farther pairs cannot collide.
+            reach = size / 2 + vehicle.speed * dt + 1e-6
+            for j in range(i + 1, len(places)):
+                if math.hypot(places[j][0] - x, places[j][1] - y) <= reach + sizes[j] / 2:
+                    vehicle.handle_collisions(self.vehicles[j], dt)
+            for thing, (there_x, there_y), extent in things:
+                if math.hypot(there_x - x, there_y - y) <= reach + extent / 2:
+                    vehicle.handle_collisions(thing, dt)
 
 
 class FastRegulatedRoad(FastRoad, RegulatedRoad):
