@@ -381,4 +381,4 @@ def test_to_enter_a_column_of_vehicles_without_a_gap_is_an_offence_and_an_overta
 @pytest.mark.slow
 @pytest.mark.parametrize("name", RULES)
 def test_the_expert_keeps_the_rules(name: str) -> None:
-    assert all(expert.drive(name, seed)[1] for seed in range(2))
+    assert expert.drive(name, 0)[1]
