@@ -31,6 +31,12 @@ def seconds(work: Callable[[], Any]) -> float:
     return time.process_time() - begin
 
 
+def ran(arguments: list[str]) -> None:
+    """Run a command; raises ``SystemExit`` if it fails."""
+    if code := run(arguments):
+        raise SystemExit(code)
+
+
 def main() -> None:
     """Measure everything."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -41,9 +47,9 @@ def main() -> None:
     shown = sum(seconds(partial(demonstrations, task, SHOWN, 5_000_000, lambda: None)) for task in tasks)
     with tempfile.TemporaryDirectory() as folder:
         options = ["--trainer.enable_progress_bar=false", f"--model.output={folder}/model", f"--trainer.default_root_dir={folder}"]
-        options += [f"--trainer.logger.save_dir={folder}", "--trainer.enable_checkpointing=false"]
+        options += [f"--trainer.logger.save_dir={folder}"]
         fit = ["fit", "--config", "conf/metaworld.yaml", *options]
-        few, more = (seconds(partial(run, [*fit, f"--trainer.max_steps={steps}"])) for steps in (10, 10 + STEPS))
+        few, more = (seconds(partial(ran, [*fit, f"--trainer.max_steps={steps}"])) for steps in (10, 10 + STEPS))
     model = FewShot.from_pretrained("pretrained/ml10", settings="conf/metaworld.yaml")
     task = "pull a drawer open by its handle"
     five, starts = model.domain.source(None).draw(task, 5, 1), model.starts(task, 1)

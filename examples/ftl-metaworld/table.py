@@ -148,6 +148,11 @@ def experts(rates: Mapping[str, Mapping[str, float]]) -> str:
     return table(["goal", "success, mean of 50 tasks", "tasks with success below one half"], lines)
 
 
+def cost(values: Mapping[str, float]) -> str:
+    """Processor time of one core."""
+    return table(["what", "processor time"], [[name, f"{value:g}"] for name, value in values.items()])
+
+
 def composed(rows: pd.DataFrame) -> str:
     """Tasks behind a wall by a composition, by the task without a wall, and by their own training concept."""
     ours = rows[(rows["domain"] == "ml45") & (rows["method"] == "FTL-IGM") & (rows["form"] == "with adapter")]
@@ -183,7 +188,7 @@ def main() -> None:
     made |= {f"{domain}": each(rows, domain) for domain in ("ml10", "ml45") if domain in set(rows["domain"])}
     if "composition" in set(rows["setting"]):
         made["composition"] = composed(rows)
-    for name, write in (("forgetting", forgotten), ("experts", experts)):
+    for name, write in (("forgetting", forgotten), ("experts", experts), ("cost", cost)):
         if (path := folder / f"{name}.json").is_file():
             made[f"{name}"] = write(json.loads(path.read_text("utf-8")))
     made["tuning"] = tuning(folder)

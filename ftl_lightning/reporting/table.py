@@ -21,6 +21,7 @@ MISSING = "-"
 PAPERS = ("paper", "difference")  #: Columns of tables of domains with a paper.
 MOST_COLUMNS = 8  #: Maximum columns of a table in the documentation.
 TRAINING, PAPER = "training", "paper"  #: Suites that come first in reports, if a domain has them.
+MORE = "more"  #: Suite of more tasks of the paper's kinds, if a domain has it: enough for a test over tasks.
 
 
 @dataclass(frozen=True)
@@ -222,8 +223,8 @@ def lookup(
 
 
 def headlines(domain: Domain, rows: pd.DataFrame) -> list[tuple[str, str]]:
-    """Settings and metrics of short tables: those with numbers of the paper and the headline, closed loop first. Without a paper:
-    the first setting of the suite ``paper``, else all settings, each with its decisive metric.
+    """Settings and metrics of short tables: those with numbers of the paper, the headline, and that of the suite ``more``, closed
+    loop first. Without a paper: the first setting of the suite ``paper``, else all settings, each with its decisive metric.
     """
     measured = set(zip(rows["setting"], rows["metric"], strict=True))
     measured_settings = settings(domain, rows)
@@ -238,5 +239,6 @@ def headlines(domain: Domain, rows: pd.DataFrame) -> list[tuple[str, str]]:
         return [headline for headline in alone if headline in measured]
     reported = [(setting, metric) for setting in measured_settings for metric in metrics(domain) if (setting, metric) in numbers]
     executed = [(setting, domain.comparison.headline) for setting in dict.fromkeys(setting for setting, _ in reported)]
-    found = [headline for headline in dict.fromkeys((*reported, *executed)) if headline in measured]
+    more = [(setting, domain.comparison.headline) for setting in _suite(domain, MORE)]
+    found = [headline for headline in dict.fromkeys((*reported, *executed, *more)) if headline in measured]
     return sorted(found, key=lambda headline: not headline[1].startswith(CLOSED))
