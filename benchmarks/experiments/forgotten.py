@@ -1,7 +1,7 @@
 """What is forgotten: success of training tasks, and of compositions with them, after a new task was learned.
 
-    python benchmarks/experiments/forgetting.py --domains object_rearrangement agent driving tabletop --out results/forgetting.json
-    python benchmarks/experiments/forgetting.py --domains mocap --root FOLDER --out results/forgetting.json
+    python benchmarks/experiments/forgotten.py --domains object_rearrangement agent driving tabletop --out results/forgetting.json
+    python benchmarks/experiments/forgotten.py --domains mocap --root FOLDER --out results/forgetting.json
 
 Each of the paper's new concepts is learned from five demonstrations (the table-top's from ten). Then every training concept
 generates with the learned concept in the sum at weight 0, so that a change of the network shows and the concept itself does not.
