@@ -37,7 +37,7 @@ LANGUAGE = BASELINES[-1]
 METHODS = (PAPERS_METHOD, Compared(OURS, CHOSEN), Compared(OURS, WITH_MODES), *map(Compared, BASELINES), Compared(FINE_TUNED))
 """Order of methods in tables; our other forms follow ours, other methods come last."""
 ALIKE = 0.9  # minimum share of episodes with our outcome for which a reference policy is annotated
-LINES = 13  # maximum number of lines of the short overview
+LINES = 12  # maximum number of lines of the short overview
 MEASURED = ("measured", "spread over seeds")  # columns of a number in the comparison
 
 

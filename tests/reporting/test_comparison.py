@@ -89,9 +89,9 @@ def test_the_overview_fits_on_one_screen_and_names_the_best_baseline(results: Pa
 
 
 @pytest.mark.slow
-def test_the_short_overview_has_at_most_ten_lines_and_all_domains(committed: pd.DataFrame, whole: Table) -> None:
+def test_the_short_overview_has_at_most_twelve_lines_and_all_domains(committed: pd.DataFrame, whole: Table) -> None:
     cells = short_overview(committed).cells
-    assert len(cells) == 10
+    assert len(cells) == 12
     subject = cells.columns[0]
     names = [told.partition(":")[0] for told in cells[subject]]
     assert list(dict.fromkeys(names)) == ["agent", "driving", "mocap", "object_rearrangement", "tabletop"]
