@@ -378,6 +378,13 @@ def test_to_enter_a_column_of_vehicles_without_a_gap_is_an_offence_and_an_overta
     assert arrived(env, "overtake")  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("name", RULES)
+def test_constant_decisions_fail_in_half_of_the_scenes_or_more(name: str) -> None:
+    for decision in ("FASTER", "IDLE", "SLOWER"):
+        ends = [final(name, lambda env, decision=decision: decision, seed) for seed in range(12)]
+        assert sum(arrived(env, name) and not env.vehicle.crashed for env in ends) <= 6, decision
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", RULES)
 def test_the_expert_keeps_the_rules(name: str) -> None:

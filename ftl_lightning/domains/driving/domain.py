@@ -212,12 +212,8 @@ DOMAIN = Domain(
     concepts=Concepts(
         training=traffic.TRAINING_CONCEPTS,
         suites=traffic.SUITES,
-        descriptions=(
-            *traffic.TRAINING_CONCEPTS,
-            "roundabout",
-            "roundabout third exit",
-            *traffic.RULES,
-        ),  # other scenarios use these concepts
+        # Other roundabouts use the concept of the roundabout.
+        descriptions=tuple(name for name in traffic.NAMES if name not in traffic.OTHER_ROUNDABOUTS),
         reads=traffic.NAMES.__contains__,
         table=Path(__file__).parent / "embeddings.safetensors",
     ),

@@ -1,9 +1,10 @@
 """Scenarios in which going is wrong: a red light, a priority stream, a ramp into dense traffic, a leader on a two-way road.
 
 Straight roads along x (metres, m/s). A sign is observed as a standing vehicle; it does not collide. The class of the other vehicles
-is ``config['other_vehicles_type']``.
+is ``config['other_vehicles_type']``; with ``config['fast']`` the faster simulation is used.
 """
 
+from abc import ABC, abstractmethod
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,8 @@ from highway_env.road.lane import LineType, StraightLane
 from highway_env.road.road import Road, RoadNetwork
 from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.objects import Obstacle
+
+from ftl_lightning.domains.driving.fast import accelerate
 
 WIDTH = StraightLane.DEFAULT_WIDTH
 """Width of a lane in metres."""
@@ -34,7 +37,7 @@ class Sign(IDMVehicle):
         """Stay."""
 
 
-class Street(AbstractEnv):
+class Street(AbstractEnv, ABC):
     """Scenario on straight roads; ``vehicle.offence`` is set when the controlled vehicle breaks the scenario's rule.
 
     The reward is .3, and up to .3 more for speed. An offence or a crash ends the episode, and so does arriving.
@@ -53,14 +56,16 @@ class Street(AbstractEnv):
         self.road = Road(RoadNetwork(), np_random=self.np_random)
         self._build()
         self.vehicle.offence = False
+        if self.config["fast"]:
+            accelerate(self.road)
 
+    @abstractmethod
     def _build(self) -> None:
         """Add lanes, the controlled vehicle and the others."""
-        raise NotImplementedError
 
+    @abstractmethod
     def arrived(self) -> bool:
         """Whether the controlled vehicle is at its destination, crashed or not."""
-        raise NotImplementedError
 
     def _offends(self, before: Any) -> bool:
         """Whether a frame that began at position ``before`` broke the rule."""
@@ -99,8 +104,8 @@ class Street(AbstractEnv):
         self.road.network.add_lane(*road, StraightLane(start, end, line_types=lines))
 
     def _ego(self, lane: tuple[str, str, int], place: float, speed: float) -> None:
-        self.vehicle = self.action_type.vehicle_class.func.make_on_lane(self.road, lane, place, speed)
-        self.vehicle = self.action_type.vehicle_class(self.road, self.vehicle.position, self.vehicle.heading, speed)
+        line = self.road.network.get_lane(lane)
+        self.vehicle = self.action_type.vehicle_class(self.road, line.position(place, 0), line.heading_at(place), speed)
         self.road.vehicles.append(self.vehicle)
 
     def _other(self, lane: tuple[str, str, int], place: float, speed: float) -> None:
@@ -202,9 +207,8 @@ class Ramp(Street):
         return any(abs(vehicle.position[0] - self.vehicle.position[0]) < self.GAP for vehicle in others)
 
     def _reward(self, action: Any) -> float:
-        return super()._reward(action) + 0.3 * (
-            self.vehicle.lane_index[2] == 0 and not self.vehicle.crashed and not self.vehicle.offence
-        )
+        earned = super()._reward(action)
+        return earned + 0.3 * (earned > 0 and self.vehicle.lane_index[2] == 0)
 
     def arrived(self) -> bool:
         return bool(self.vehicle.position[0] > self.END + 20)

@@ -111,22 +111,6 @@ class ThirdExit(Roundabout):
         self.vehicle.plan_route_to("wxs")
 
 
-class RedLight(_Accelerated, rules.RedLight):
-    """Red light in the faster classes."""
-
-
-class GiveWay(_Accelerated, rules.GiveWay):
-    """Stream with priority in the faster classes."""
-
-
-class Ramp(_Accelerated, rules.Ramp):
-    """Ramp in the faster classes."""
-
-
-class Overtake(_Accelerated, rules.Overtake):
-    """Two-way road in the faster classes."""
-
-
 @dataclass(frozen=True)
 class Scenario:
     """Driving scenario.
@@ -197,10 +181,10 @@ SCENARIOS = {
     "roundabout third exit": Scenario(ThirdExit, {"duration": 10}, _on(("wx", "wxs"), ("wxs", "wxr")), destinations=EXITS),
     "roundabout of three lanes": _other_roundabout(radius=28, lanes=3, vehicles=7),
     "roundabout of one lane": _other_roundabout(radius=16, lanes=1, vehicles=4),
-    "red light": _ruled(RedLight),
-    "give way": _ruled(GiveWay),
-    "ramp": _ruled(Ramp),
-    "overtake": _ruled(Overtake),
+    "red light": _ruled(rules.RedLight),
+    "give way": _ruled(rules.GiveWay),
+    "ramp": _ruled(rules.Ramp),
+    "overtake": _ruled(rules.Overtake),
 }
 
 
