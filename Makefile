@@ -11,7 +11,7 @@ MARKED := slow or browser or release or notebook or cluster or fuzz
 # Without it every interpreter compiles all that it imports, for seconds.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: install minilm run test test-all coverage lint format report ablation comparison benchmark docs docs-sphinx docs-pages fields
+.PHONY: install minilm run test test-all coverage lint format report ablation comparison benchmark docs docs-sphinx docs-pages
 
 install: .venv/installed
 
@@ -88,5 +88,3 @@ docs-sphinx:
 docs-pages:
 	$(BIN)/python docs/pages.py docs/_build/html
 
-fields: install # the tables of fields in docs/own-domain.md, from the docstrings
-	$(BIN)/python docs/fields.py

@@ -23,11 +23,10 @@ from ftl_lightning.services.tensor_file import write_text
 ROOT = Path(__file__).parent.parent
 HEAD = """# The paper, item by item
 
-Each table, figure and claim of *Few-Shot Task Learning through Inverse Generative Modeling* in its order, with the paper's value
-beside ours. *Same*: the same setting. *Other*: the setting differs as said, so that the two numbers are not of the same thing.
-*Not there*: not measured, and why. Ours is the mean ± standard error over tasks, with the standard deviation over seeds. All
-differences stand [together](differences.md). Films of all methods from the same starts: <a href="watch.html">the page to watch</a>
-(part of the site that `make docs` builds; `python -m ftl_lightning report --html page.html` writes it anywhere).
+Which results of *Few-Shot Task Learning through Inverse Generative Modeling* are reproduced. Ours: mean ± standard error over tasks
+(standard deviation over seeds), by `make comparison` and `make ablation [DOMAIN=...]`. *Other setting*: the two
+numbers are not of the same thing; texts are embedded by MiniLM, and networks, most losses, learning and sampling are
+[ours](differences.md); items name what else differs. Films of all methods: <a href="watch.html">page to watch</a> (`make docs`).
 """
 VERDICTS = {"same": "same setting", "other": "other setting", "absent": "not there"}
 

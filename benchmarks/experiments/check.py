@@ -2,7 +2,7 @@
 
 Sets of five demonstrations of a concept are drawn from pools. The last demonstration has a single fault, which is detected if a
 warning names the demonstration. With models, the last demonstration shows another concept, and concepts are learned from all but
-one demonstration (leave-one-out); the odd demonstration is detected if it is named.
+one demonstration (leave-one-out); the outlier is detected if it is named.
 
     python benchmarks/experiments/check.py --out results/check.json
 """
@@ -79,7 +79,7 @@ def faults(draw: Draw, kinds: tuple[str, ...], sets: int) -> dict[str, float]:
     return {name: round(sum(values) / len(values), 4) for name, values in counts.items()}
 
 
-def odd(model: FewShot, draw: Draw, kinds: tuple[str, ...], sets: int) -> dict[str, float]:
+def outlier(model: FewShot, draw: Draw, kinds: tuple[str, ...], sets: int) -> dict[str, float]:
     """Shares of sets in which the demonstration of another concept is named, another one is, and any one of a good set is."""
     found, wrong, blamed = 0, 0, 0
     for number in range(sets):
@@ -88,7 +88,7 @@ def odd(model: FewShot, draw: Draw, kinds: tuple[str, ...], sets: int) -> dict[s
         mixed = concatenate([good.rows(range(FEW - 1)), replace(draw(another, 1, 10_000 + number), concepts=(kind,))])
         for demonstrations, expected in ((mixed, FEW - 1), (good, None)):
             left = model.check(demonstrations, name=kind, learn=True).left_out
-            named = left.odd if left is not None else None
+            named = left.outlier if left is not None else None
             found += expected is not None and named == expected
             wrong += expected is not None and named not in (None, expected)
             blamed += expected is None and named is not None
@@ -125,8 +125,8 @@ def main() -> None:
         for name in ("relations", "paths"):
             family = FAMILIES[name]
             model = pretrained(name, family, options.folder)
-            learned[name] = odd(model, _arrays(family.draw, model), tuple(family.new), options.learned)
-        result["odd one, after learning"] = learned
+            learned[name] = outlier(model, _arrays(family.draw, model), tuple(family.new), options.learned)
+        result["outlier, after learning"] = learned
     text = json.dumps(result, indent=2)
     print(text)
     if options.out:

@@ -1,4 +1,4 @@
-"""The odd demonstration and "these suffice" of ``check`` on ten sets of behaviour; no model is trained.
+"""The outlier and "these suffice" of ``check`` on ten sets of behaviour; no model is trained.
 
     python benchmarks/experiments/check_real.py --out results/check_real.json
 
@@ -19,7 +19,7 @@ from real_data import FEW, FEW_SEED, FRESH_SEED, NAMES, REAL, RULE, RealSet, set
 
 from ftl_lightning.data.check import check
 from ftl_lightning.data.demonstrations import concatenate
-from ftl_lightning.data.enough import Enough, Oddness
+from ftl_lightning.data.enough import Enough, Outliers
 from ftl_lightning.data.references import WARPED, Reference, Setting
 from ftl_lightning.services.randomness import generator
 
@@ -27,7 +27,7 @@ KNOWN, OTHER, SHOWN = 6, 5000, 100
 """Known demonstrations of each training kind, seed offset of exchanged ones, and samples that a rule judges."""
 
 
-def odd(data: RealSet, oddness: Oddness, number: int) -> dict[str, bool]:
+def outlier(data: RealSet, score: Outliers, number: int) -> dict[str, bool]:
     """Whether the exchanged demonstration is named, another one is, and any of five good ones is."""
     draw, kind = np.random.default_rng(number), data.new[number % len(data.new)]
     others = [name for name in (data.new if number // len(data.new) % 2 else data.training) if name != kind]
@@ -37,7 +37,7 @@ def odd(data: RealSet, oddness: Oddness, number: int) -> dict[str, bool]:
     named = []
     for five in (exchanged, good):
         warned = {row for finding in check(five) if finding.severity != "note" for row in finding.rows}
-        named.append(warned | {row for row in (oddness.odd(five),) if row is not None})
+        named.append(warned | {row for row in (score.outlier(five),) if row is not None})
     return {"named": FEW - 1 in named[0], "another": bool(named[0] - {FEW - 1}), "good": bool(named[1])}
 
 
@@ -69,11 +69,11 @@ def main() -> None:
     )
     for name, data in sets(options.sets).items():
         training = data.pretraining(KNOWN)
-        oddness = Oddness(training, int(training.lengths.max()))
-        trials = [odd(data, oddness, number) for number in range(options.number)]
+        score = Outliers(training, int(training.lengths.max()))
+        trials = [outlier(data, score, number) for number in range(options.number)]
         shares = {key: round(float(np.mean([trial[key] for trial in trials])), 4) for key in trials[0]}
         verdicts = [enough(data, kind, draw) for kind in data.new[:2] for draw in range(2)]
-        found[name] = {"odd": shares, "enough": verdicts}
+        found[name] = {"outlier": shares, "enough": verdicts}
         share, truth = (float(np.mean([row[key] for row in verdicts])) for key in ("suffices", "truth"))
         lines.append(f"| {name} | {' | '.join(f'{value:.2f}' for value in (*shares.values(), share, truth))} |")
         print(lines[-1], flush=True)

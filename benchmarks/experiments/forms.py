@@ -177,7 +177,7 @@ def summary(families: Mapping[str, Kinds]) -> dict[str, dict[str, Numbers]]:
 
 LOSSES = ("loss, own", "loss, left out", "loss, left out, in span")
 PREDICTED = {ONE: LOSSES[1:2], SPAN: LOSSES[2:], ADAPTED: LOSSES}
-"""Losses, shares of the empty concept's, whose sum is to tell how many samples of a form are right."""
+"""Losses, shares of the unconditional loss, whose sum is to tell how many samples of a form are right."""
 
 
 def points(kinds: Kinds) -> dict[str, list[list[float]]]:
@@ -209,7 +209,7 @@ def draw(found: Mapping[str, list[list[float]]], path: str) -> None:
         axes.set(xlabel=" + ".join(name.removeprefix("loss, ") for name in PREDICTED[form]), ylim=(-0.05, 1.05))
         axes.axvline(1 if len(PREDICTED[form]) == 1 else ALL, color="grey", linewidth=0.8)
     figure.axes[0].set_ylabel("samples that are right")
-    figure.supxlabel("loss / the empty concept's", fontsize=9)
+    figure.supxlabel("loss / unconditional loss", fontsize=9)
     figure.savefig(path, dpi=120)
 
 

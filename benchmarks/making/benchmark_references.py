@@ -1,4 +1,4 @@
-"""Write the reference lines of the benchmark's leaderboard from a run of one of this package's methods.
+"""Write the references of the benchmark's leaderboard from a run of one of this package's methods.
 
 python benchmarks/making/benchmark_references.py results/submissions/ftl_igm.json
 """

@@ -101,7 +101,7 @@ def prepare(domain: str, root: str = "", out: str = "") -> None:
 
 @dataclass(frozen=True)
 class CheckOptions:
-    """Say whether demonstrations of a concept suffice, and which of them is odd.
+    """Say whether demonstrations of a concept suffice, and which of them is an outlier.
 
     Attributes:
         file: file of demonstrations (.npz or .safetensors), folder of a LeRobot data set, or name of a Minari data set; each of its

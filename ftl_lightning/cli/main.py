@@ -79,7 +79,7 @@ COMMANDS: Mapping[str, Command] = {
     ),
     "generate": Command("draw demonstrations of a task into a file", demonstrations.generate, positional=True),
     "check": Command(
-        "say whether demonstrations of a concept suffice, and which of them is odd",
+        "say whether demonstrations of a concept suffice, and which of them is an outlier",
         demonstrations.check,
         demonstrations.CheckOptions,
         positional=True,

@@ -134,7 +134,7 @@ def check(demonstrations: Demonstrations) -> tuple[Finding, ...]:
     if (count := len(demonstrations)) > MOST_CHECKED:
         part = Finding(f"the first {MOST_CHECKED} of {count} demonstrations are checked", "note")
         return (*check(demonstrations.rows(list(range(MOST_CHECKED)))), part)
-    few = Finding("three to five demonstrations are usual; fewer do not show which of them is odd", "note")
+    few = Finding("three to five demonstrations are usual; fewer do not show which of them is an outlier", "note")
     demonstrations, kinds = _continuous(demonstrations)
     findings = [*([few] if len(demonstrations) < 3 else []), *kinds]
     if (width := demonstrations.states.shape[2]) > MOST_WIDTH:

@@ -1,4 +1,4 @@
-"""Whether a few demonstrations suffice, by their skill on left-out ones, and which of them is odd. Neither needs learning."""
+"""Whether a few demonstrations suffice, by their skill on left-out demonstrations, and which is an outlier; without learning."""
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
@@ -191,14 +191,14 @@ EVEN = 0.2
 """Variance that is added to that within concepts in each number of a feature, relative to the mean variance."""
 
 
-class Oddness:
+class Outliers:
     """How much more a demonstration differs from the others than these from each other and than it from a training concept.
 
     Paths are moved to the same places where places are observed. Each number of the features of
     :class:`~ftl_lightning.data.distances.PathFeatures` is scaled by its standard deviation within training concepts. With the mean
-    distance ``d`` of a demonstration to the others, ``o`` among the others, and ``r`` to the nearest training concept, the oddness
-    is the mean over features of ``log(d / o) + 2 log(d / r)``. A demonstration is odd if its oddness is the largest, and larger
-    than in sets of as many demonstrations of a training concept, which is then not among those compared with.
+    distance ``d`` of a demonstration to the others, ``o`` among the others, and ``r`` to the nearest training concept, the score
+    is the mean over features of ``log(d / o) + 2 log(d / r)``. A demonstration is an outlier if its score is the largest, and
+    larger than in sets of as many demonstrations of a training concept, which is then not among those compared with.
 
     Args:
         training: demonstrations of training concepts.
@@ -240,8 +240,8 @@ class Oddness:
         width = paths.shape[2]
         return self._encoded(paths - frames.shift(seen, width) + frames.shift(self.usual, width))
 
-    def _oddness(self, paths: Tensor, seen: Observed, without: int | None = None) -> Tensor:
-        """Oddness ``(demo,)`` of paths ``(demo, horizon, state)``, compared with training concepts but one."""
+    def _score(self, paths: Tensor, seen: Observed, without: int | None = None) -> Tensor:
+        """Outliers ``(demo,)`` of paths ``(demo, horizon, state)``, compared with training concepts but one."""
         every, count = [number for number in range(len(self.rows)) if number != without], len(paths)
         found, values = [], list[Tensor]()
         for row in range(count):
@@ -270,21 +270,21 @@ class Oddness:
         return torch.stack(found)
 
     def _limit(self, count: int) -> float:
-        """Largest usual oddness among ``count`` demonstrations of a concept."""
+        """Largest usual score among ``count`` demonstrations of a concept."""
         draw, most = generator("cpu", 0, 11), []
         for number in range(DRAWN_MOVED if self.setting.places else DRAWN):
             concept = number % len(self.rows)
             rows = self.rows[concept]
             chosen = [rows[index] for index in torch.randperm(len(rows), generator=draw)[:count].tolist()]
-            most.append(self._oddness(self.paths[chosen], _of(self.seen, chosen), concept).max())
+            most.append(self._score(self.paths[chosen], _of(self.seen, chosen), concept).max())
         return float(torch.stack(most).max())
 
-    def odd(self, demonstrations: Demonstrations) -> int | None:
-        """Index of the odd demonstration; ``None`` without any, or with too few demonstrations or training concepts."""
+    def outlier(self, demonstrations: Demonstrations) -> int | None:
+        """Index of the outlier; ``None`` without any, or with too few demonstrations or training concepts."""
         if not FEWEST <= len(demonstrations) <= MOST or len(self.rows) < 2:
             return None
-        oddness = self._oddness(first_windows(demonstrations, self.horizon), vectors_of(demonstrations))
-        return int(oddness.argmax()) if float(oddness.max()) > self.limit(len(demonstrations)) else None
+        score = self._score(first_windows(demonstrations, self.horizon), vectors_of(demonstrations))
+        return int(score.argmax()) if float(score.max()) > self.limit(len(demonstrations)) else None
 
 
 def _of(observed: Observed, rows: list[int]) -> Observed:

@@ -1,1 +1,1 @@
-"""Evaluation: generated behaviour, closed-loop execution, reference lines, results files and pictures."""
+"""Evaluation: generated behaviour, closed-loop execution, references, results files and pictures."""

@@ -178,7 +178,7 @@ class Evaluator(pl.Callback):
                 log_test(logger, hparams, measured, trainer.global_step)
 
     def _compare(self, domain: Domain, data: PretrainingData | InversionData) -> Mapping[str, Sequence[TaskResult]]:
-        """Measure novelty and coverage, and return the reference lines by name."""
+        """Measure novelty and coverage, and return the references by name."""
         seed, environments = self.generation.seed, self.generation.environments
         compared = self.references if self.references is not None else not getattr(data, "of_user", False)
         reference_lines = references(self.judged, domain, seed, environments) if compared else {}

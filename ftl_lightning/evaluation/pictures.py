@@ -162,7 +162,7 @@ def write_films(
 
     Args:
         path, domain, judged: file, domain that draws, and behaviour of the method.
-        references: behaviour of the reference lines, by name.
+        references: behaviour of the references, by name.
         rows: rows of the evaluation, which describe the films.
     """
     shapes: dict[str, int] = {}  # many films share roads and tables

@@ -1,16 +1,16 @@
-"""Comparison of generated behaviour: reference lines, novelty and coverage.
+"""Comparison of generated behaviour: references, novelty and coverage.
 
-*Reference lines* are the behaviour of trivial policies and oracles on the same tasks and initial states.
+*References* are the behaviour of trivial policies and oracles on the same tasks and initial states.
 
 *Novelty* is the mean distance of a generated plan to the nearest demonstration of its concept: 0 for a method that replays
 demonstrations. *Coverage* is the mean distance of a fresh sample of the task to the nearest generated plan: lower is better, and a
 method that always generates the same plan has a high coverage even if the plan is right. Both use the domain's distance.
 
-Novelty alone means little: wrong plans can be arbitrarily novel. Two reference lines give the scale: *demonstrations replayed* in
+Novelty alone means little: wrong plans can be arbitrarily novel. Two references give the scale: *demonstrations replayed* in
 turn (right, nothing new) and *fresh samples*, an independent draw of the task (right, as novel as new behaviour is).
 
 Coverage decreases with the number of plans: compare values with an equal column n of the results. The covered samples and the
-reference line have n samples each.
+reference have n samples each.
 """
 
 import logging
@@ -41,7 +41,7 @@ _LOG = logging.getLogger(__name__)
 
 T = TypeVar("T")
 REPLAYED, FRESH = "demonstrations replayed", "fresh samples"
-"""Names of the reference lines of novelty and coverage."""
+"""Names of the references of novelty and coverage."""
 KEPT = 500  # plans, rollouts and fresh samples in the cache: several times those of an evaluation
 _CACHE: dict[Hashable, Any] = {}
 """Reference behaviour by name and all arguments, shared by the cells of an ablation."""
@@ -130,7 +130,7 @@ class Real:
         domain: domain of the task.
         count: number of generated plans.
         demonstrations: demonstrations of the task's concept; ``None`` if novelty does not apply.
-        fresh: two sets of ``count`` real samples, to cover and as a reference line; ``None`` if the domain cannot draw any.
+        fresh: two sets of ``count`` real samples, to cover and as a reference; ``None`` if the domain cannot draw any.
     """
 
     task: EvaluationTask
@@ -188,7 +188,7 @@ class Real:
         return self._judged(self.demonstrations.rows(turns.tolist()))
 
     def lines(self) -> dict[str, TaskResult]:
-        """Judge the reference lines by name: ``count`` replayed demonstrations, and as many fresh samples.
+        """Judge the references by name: ``count`` replayed demonstrations, and as many fresh samples.
 
         Replayed demonstrations, whose novelty is 0, are omitted if only novelty is measured.
         """
@@ -232,7 +232,7 @@ def real_behaviour(judged: Sequence[TaskResult], domain: Domain, root: Path | No
 
 
 def lines(real: Sequence[Real]) -> dict[str, list[TaskResult]]:
-    """Reference lines of all tasks, by name."""
+    """References of all tasks, by name."""
     by_task = [behaviour.lines() for behaviour in real]
     return {name: judged for name in (REPLAYED, FRESH) if (judged := [line[name] for line in by_task if name in line])}
 

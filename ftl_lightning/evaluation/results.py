@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 METHOD, REFERENCE = "method", "reference"
-"""Roles: methods, and reference lines (chance, trivial policies, oracles)."""
+"""Roles: methods, and references (chance, trivial policies, oracles)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,12 +29,12 @@ class Row:
 
     Attributes:
         domain, setting, task: evaluated task.
-        method: name of the method, for example ``'FTL-IGM'`` or ``'BC'``, or of the reference line.
+        method: name of the method, for example ``'FTL-IGM'`` or ``'BC'``, or of the reference.
         form: form of the method, see :class:`~ftl_lightning.domains.comparison.Compared`; empty for the paper's.
         variant: label of settings of the same method and form, for example ``'entities, free'``; may be empty.
         role: :data:`METHOD` or :data:`REFERENCE`.
         K: number of concept components; 0 without learning.
-        omega: fixed guidance weight as text, ``'learned'``, or ``'none'`` for a method without; empty for a reference line.
+        omega: fixed guidance weight as text, ``'learned'``, or ``'none'`` for a method without; empty for a reference.
         demonstrations: number of demonstrations of the task's concept; 0 without learning.
         seed: seed of pretraining and inversion.
         n: number of samples or episodes behind the value.
@@ -132,13 +132,13 @@ def rows(
     configured: Mapping[str, Any],
     variant: str | None = None,
 ) -> list[Row]:
-    """Rows of an evaluation: the method, its paired comparison with policies, and the reference lines.
+    """Rows of an evaluation: the method, its paired comparison with policies, and the references.
 
     Args:
         module: evaluated module.
         domain: domain of the tasks.
         judged: behaviour of the method.
-        references: behaviour of the reference lines, by name.
+        references: behaviour of the references, by name.
         configured: see :func:`configuration`.
         variant: label of the run in tables; ``None`` for the module's label.
     """
@@ -178,7 +178,7 @@ def rows(
 
 
 def reference_hash(configured: Mapping[str, Any]) -> str:
-    """Hash of what the values of reference lines depend on, besides task and seed of the row."""
+    """Hash of what the values of references depend on, besides task and seed of the row."""
     keys = ("domain", "environment", "evaluation/samples", "evaluation/sample_seed")
     return config_hash({key: value for key, value in configured.items() if key in keys or key.startswith("metric/")})
 

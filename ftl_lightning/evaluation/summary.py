@@ -89,14 +89,14 @@ def _number(text: str) -> float | str:
 
 
 def own_rows(rows: Sequence[Row]) -> list[Row]:
-    """Rows of the method without reference lines and paired comparisons."""
+    """Rows of the method without references and paired comparisons."""
     return [row for row in rows if row.role == METHOD and not row.metric.startswith((WON, LOST))]
 
 
 def summary_table(rows: Sequence[Row], single: Sequence[str] = ()) -> Table:
     """Summarise an evaluation: a line for each task in ``single``, then the mean of each setting.
 
-    Lines with a dash are the reference lines of the same tasks. Errors are standard errors over tasks; a single task has none. The
+    Lines with a dash are the references of the same tasks. Errors are standard errors over tasks; a single task has none. The
     column n is the number of tasks x samples per task.
 
     Args:

@@ -98,7 +98,7 @@ def setting_means(values: Iterable[tuple[str, str, float]]) -> dict[str, float]:
 def log_test(logger: TensorBoardLogger, settings: Mapping[str, Any], rows: Sequence[Row], step: int) -> None:
     """Log the results of a test to the HPARAMS tab and, as tables of settings and tasks, to the TEXT tab.
 
-    ``settings`` are those of :func:`ftl_lightning.evaluation.summary.hparams_of`; ``rows`` include reference lines.
+    ``settings`` are those of :func:`ftl_lightning.evaluation.summary.hparams_of`; ``rows`` include references.
     """
     measured = own_rows(rows)
     means = setting_means((row.setting, row.metric, row.value) for row in measured)

@@ -399,7 +399,7 @@ class FewShot(Shown):
         learn: bool = False,
         progress: bool = False,
     ) -> Check:
-        """Check whether demonstrations of a concept suffice, and find an odd demonstration; ``print`` the result.
+        """Check whether demonstrations of a concept suffice, and find an outlier; ``print`` the result.
 
         Args:
             states, observed, name: see :meth:`demonstrations`; states may be missing (NaN).

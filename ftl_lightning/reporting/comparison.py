@@ -2,11 +2,13 @@
 
 from collections.abc import Sequence
 from itertools import zip_longest
+from operator import itemgetter
 
 import pandas as pd
 
 from ftl_lightning.domains.comparison import CHOSEN, FINE_TUNED, OURS, PAPERS_METHOD, WITH_MODES, Compared
 from ftl_lightning.domains.domain import Domain
+from ftl_lightning.evaluation.references import FRESH
 from ftl_lightning.evaluation.results import METHOD, REFERENCE, label, latest
 from ftl_lightning.reporting.paired import Lead, leads, least_certain, same_outcome
 from ftl_lightning.reporting.table import (
@@ -37,7 +39,8 @@ LANGUAGE = BASELINES[-1]
 METHODS = (PAPERS_METHOD, Compared(OURS, CHOSEN), Compared(OURS, WITH_MODES), *map(Compared, BASELINES), Compared(FINE_TUNED))
 """Order of methods in tables; our other forms follow ours, other methods come last."""
 ALIKE = 0.9  # minimum share of episodes with our outcome for which a reference policy is annotated
-LINES = 12  # maximum number of lines of the short overview
+LINES = 7  # maximum number of lines of the short overview
+ORACLE = "(oracle)"  # in the names of references that know the right behaviour
 MEASURED = ("measured", "spread over seeds")  # columns of a number in the comparison
 
 
@@ -53,7 +56,7 @@ def all_methods(comparison: pd.DataFrame, ablations: pd.DataFrame) -> pd.DataFra
 
 
 def reference_lines(domain: Domain, results: pd.DataFrame) -> pd.DataFrame:
-    """The latest rows of reference lines: chance, trivial policies and oracles."""
+    """The latest rows of references: chance, trivial policies and oracles."""
     return latest(select(results, domain=domain.name, role=REFERENCE))
 
 
@@ -93,7 +96,7 @@ def comparison_table(domain: Domain, results: pd.DataFrame, shown: Sequence[str]
 
 
 def references_table(domain: Domain, results: pd.DataFrame) -> Table:
-    """Table of reference lines, with a line for each setting, metric and reference line."""
+    """Table of references, with a line for each setting, metric and reference."""
     references = reference_lines(domain, results)
     lines = [
         [setting, metric, str(name), number.with_error(), _spread(number)]
@@ -102,8 +105,8 @@ def references_table(domain: Domain, results: pd.DataFrame) -> Table:
         for name, measured in select(references, setting=setting, metric=metric).groupby("method")
         if (number := summarise(measured))
     ]
-    caption = f"{domain.name}: reference lines (chance, trivial policies and oracles), mean ± standard error over tasks"
-    return make_table(domain, "comparison_references", caption, lines, ["setting", "metric", "reference line", *MEASURED])
+    caption = f"{domain.name}: references (chance, trivial policies and oracles), mean ± standard error over tasks"
+    return make_table(domain, "comparison_references", caption, lines, ["setting", "metric", "reference", *MEASURED])
 
 
 def _spread(number: Number) -> str:
@@ -141,14 +144,17 @@ def shown_lines(results: pd.DataFrame) -> list[tuple[Domain, str, str]]:
 
 
 def short_lines(results: pd.DataFrame) -> list[tuple[Domain, str, str]]:
-    """At most :data:`LINES` lines of :func:`shown_lines`: the headlines of each domain in turn."""
-    lines = {
-        domain.name: [
-            (domain, setting, metric) for setting, metric in headlines(domain, rows) if _comparable(domain, rows, setting, metric)
-        ]
-        for domain in _domains(results)
-        for rows in [compared(domain, results)]
-    }
+    """At most :data:`LINES` lines of :func:`shown_lines`: of each domain in turn the settings of new concepts in the metric of the
+    headline, those with most tasks first.
+    """
+    lines: dict[str, list[tuple[Domain, str, str]]] = {}
+    for domain in _domains(results):
+        rows, metric = compared(domain, results), domain.comparison.headline
+        found = [setting for setting, reported in headlines(domain, rows) if reported == metric]
+        learned = {task.setting for suite in domain.concepts.suites.values() for task in suite.tasks if task.learned}
+        found = [name for name in found if name in learned and _comparable(domain, rows, name, metric)]
+        found.sort(key=lambda setting: -select(rows, setting=setting)["task"].nunique())
+        lines[domain.name] = [(domain, setting, metric) for setting in found]
     shown = [line for turn in zip_longest(*lines.values()) for line in turn if line][:LINES]
     return sorted(shown, key=lambda line: list(lines).index(line[0].name))
 
@@ -165,19 +171,51 @@ def overview(results: pd.DataFrame) -> Table:
 
 
 def short_overview(results: pd.DataFrame) -> Table:
-    """The overview in at most :data:`LINES` lines; our other forms are the chosen form and the default form of the domain."""
-    domains = _domains(results)
-    defaults = {domain.comparison.ours for domain in domains}
-    columns = [
-        method
-        for method in methods(results)
-        if method.name != OURS or not method.form or method in defaults or CHOSEN in method.form
-    ]
-    return _overview(results, short_lines(results), columns)
+    """At most :data:`LINES` lines: ours in the paper's form, the chosen form and the domain's default form, the baseline and the
+    reference with the best mean, and the lead.
+    """
+    lines = []
+    for domain, setting, metric in short_lines(results):
+        rows, references = compared(domain, results), reference_lines(domain, results)
+        sign = -1 if domain.less_is_better(metric) else 1
+        ours = [
+            (method.form, cell)
+            for method in methods(rows)
+            if method.name == OURS and (method == domain.comparison.ours or not method.form or CHOSEN in method.form)
+            if (cell := _cell(domain, rows, method, setting, metric)) != MISSING
+        ]
+        rivals = [
+            (sign * number.mean, f"{label(*method)} {_cell(domain, rows, method, setting, metric)}")
+            for method in methods(rows)
+            if method.name != OURS
+            if (number := summarise(select(of_method(rows, method), setting=setting, metric=metric)))
+        ]
+        means = select(references, setting=setting, metric=metric).groupby("method")["value"].mean()
+        best = [
+            max(named, key=lambda found: sign * found[1])
+            for kind in (False, True)
+            if (named := [(name, mean) for name, mean in means.items() if (ORACLE in str(name) or name == FRESH) == kind])
+        ]
+        lead = least_certain(_leads(domain, rows, setting, metric))
+        lines.append(
+            [
+                _subject(domain, setting, metric),
+                ", ".join(f"{form} {cell}".strip() for form, cell in ours) or MISSING,
+                max(rivals, key=itemgetter(0))[1] if rivals else MISSING,
+                ", ".join(f"{name} {mean:.2f}" for name, mean in best) or MISSING,
+                MISSING if lead is None else str(lead),
+            ]
+        )
+    caption = (
+        f"New concepts, mean ± standard error over tasks{_brackets(results)}. FTL-IGM: first the paper's form of the concept; "
+        "networks, views and losses are ours. Lead: by how much ours is better, with its 95 % interval over tasks"
+    )
+    head = ["domain: setting, metric", OURS, "best baseline", "best without learning, oracle", "lead"]
+    return make_table(None, "overview", caption, lines, head)
 
 
 def overview_tables(results: pd.DataFrame) -> list[Table]:
-    """The overview in tables of few columns: the lead and our forms, the other methods, the reference lines."""
+    """The overview in tables of few columns: the lead and our forms, the other methods, the references."""
     whole = overview(results)
     subject, lead, *columns = whole.cells.columns
     ours = [name for name in columns if name == label(*PAPERS_METHOD)]
@@ -194,12 +232,12 @@ def overview_tables(results: pd.DataFrame) -> list[Table]:
         for rows, references in [(compared(domain, results), reference_lines(domain, results))]
         for line in shown_lines(select(results, domain=domain.name))
     ]
-    caption = "Reference lines: chance, trivial policies and oracles, the least first"
-    return [*tables, make_table(None, "overview_references", caption, lines, [subject, "reference lines"])]
+    caption = "References: chance, trivial policies and oracles, the least first"
+    return [*tables, make_table(None, "overview_references", caption, lines, [subject, "references"])]
 
 
 def headline_tables(domain: Domain, results: pd.DataFrame) -> list[Table]:
-    """Headlines of a domain: a line for each method or reference line, a column for each setting and metric."""
+    """Headlines of a domain: a line for each method or reference, a column for each setting and metric."""
     rows, references = compared(domain, results), reference_lines(domain, results)
     shown = headlines(domain, rows)[: MOST_COLUMNS - 1]
     heads = [f"{setting}, {metric}" for setting, metric in shown]
@@ -211,7 +249,7 @@ def headline_tables(domain: Domain, results: pd.DataFrame) -> list[Table]:
     marks = " [the paper's]" if published(domain) else ""
     sources = (
         ("headline", f"{domain.name}: mean ± standard error over tasks{marks}", "method", measured),
-        ("headline_references", f"{domain.name}: reference lines", "reference line", of_references),
+        ("headline_references", f"{domain.name}: references", "reference", of_references),
     )
     return [
         make_table(None, name, caption, [line for line in lines if set(line[1:]) != {MISSING}], [head, *heads])
@@ -220,28 +258,35 @@ def headline_tables(domain: Domain, results: pd.DataFrame) -> list[Table]:
 
 
 def _overview(results: pd.DataFrame, lines: Sequence[tuple[Domain, str, str]], columns: Sequence[Compared]) -> Table:
-    ours = sorted((method for method in columns if method.name == OURS), key=lambda method: method != PAPERS_METHOD)
-    rest = [method for method in columns if method not in ours]
+    grouped: dict[str, list[Compared]] = {}
+    for method in sorted(columns, key=lambda method: method != PAPERS_METHOD):
+        grouped.setdefault(_base(method), []).append(method)
     cells = []
     rows_of = {domain.name: compared(domain, results) for domain in _domains(results)}
     for domain, setting, metric in lines:
         rows = rows_of[domain.name]
         lead = least_certain(_leads(domain, rows, setting, metric))
         rows = select(rows, setting=setting, metric=metric)
-        cell_of = {method: _cell(domain, rows, method, setting, metric) for method in columns}
         form = f"{domain.comparison.ours.form}: " if domain.comparison.ours.form and lead else ""
         line = [_subject(domain, setting, metric), MISSING if lead is None else f"{form}{lead}"]
-        if ours:
-            named = [f"{method.form} {cell_of[method]}".strip() for method in ours if cell_of[method] != MISSING]
-            line.append(", ".join(named) or MISSING)
-        cells.append([*line, *(cell_of[method] for method in rest)])
-    head = ["domain: setting, metric", "lead", *[label(*PAPERS_METHOD)] * bool(ours), *(label(*method) for method in rest)]
-    legend = f". {label(*PAPERS_METHOD)}: first the paper's form of the concept; guidance, networks, views and losses are ours"
+        for name, group in grouped.items():
+            cell_of = {
+                label(*method).removeprefix(name).strip(", "): _cell(domain, rows, method, setting, metric) for method in group
+            }
+            line.append(", ".join(f"{form} {cell}".strip() for form, cell in cell_of.items() if cell != MISSING) or MISSING)
+        cells.append(line)
+    head = ["domain: setting, metric", "lead", *grouped]
+    legend = f". {PAPERS_METHOD.name}: first the paper's form of the concept; guidance, networks, views and losses are ours"
     caption = (
         f"Ours and the baselines, mean ± standard error over tasks{_brackets(results)}; lead: by how much ours is better than the "
-        f"best baseline, with its 95 % interval over tasks{legend * (len(ours) > 1)}"
+        f"best baseline, with its 95 % interval over tasks{legend * (len(grouped.get(OURS, ())) > 1)}"
     )
     return make_table(None, "overview", caption, cells, head)
+
+
+def _base(method: Compared) -> str:
+    """Name of the column of a method: ``'BC'`` for ``'BC, our network'`` and for every form of BC."""
+    return method.name.partition(", ")[0]
 
 
 def _brackets(results: pd.DataFrame) -> str:
@@ -257,7 +302,7 @@ def _subject(domain: Domain, setting: str, metric: str) -> str:
 
 
 def _references(domain: Domain, rows: pd.DataFrame, references: pd.DataFrame, setting: str, metric: str) -> str:
-    """Means of the reference lines, ascending; policies that nearly agree with ours have the number of equal outcomes."""
+    """Means of the references, ascending; policies that nearly agree with ours have the number of equal outcomes."""
     ours = of_method(select(rows, setting=setting), domain.comparison.ours)
     agreeing = {}
     for policy in policies(domain) if metric == domain.comparison.headline else ():

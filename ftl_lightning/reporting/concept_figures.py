@@ -16,7 +16,7 @@ from ftl_lightning.training.checks import Check
 from ftl_lightning.training.concept_model import ConceptModel
 
 MOST = 20  # maximum number of concepts in the figure of a check
-GOOD, ODD = "#3f6fb5", "#d03a3a"
+GOOD, OUTLYING = "#3f6fb5", "#d03a3a"
 
 
 @dataclass(frozen=True)
@@ -76,16 +76,16 @@ def check_figure(checks: Sequence[Check]) -> Figure:
     columns = 2 + 2 * any(check.left_out for check in shown)
     figure = Figure(figsize=(3.2 * columns, 3.0 * len(shown)), layout="constrained")
     for check, row in zip(shown, figure.subplots(len(shown), columns, squeeze=False), strict=True):
-        odd = {number for finding in check.warnings for number in finding.rows}
-        odd |= set() if check.left_out is None or check.left_out.odd is None else {check.left_out.odd}
-        _behaviour(row[0], check, odd)
+        outlier = {number for finding in check.warnings for number in finding.rows}
+        outlier |= set() if check.left_out is None or check.left_out.outlier is None else {check.left_out.outlier}
+        _behaviour(row[0], check, outlier)
         _distances(row[1], check)
         if check.left_out is not None:
             left, curve = check.left_out.left_out, check.left_out.curve
             numbers = range(1, len(left) + 1)
-            row[2].bar(numbers, left, color=[ODD if number - 1 in odd else GOOD for number in numbers])
+            row[2].bar(numbers, left, color=[OUTLYING if number - 1 in outlier else GOOD for number in numbers])
             row[2].axhline(1, color="black", linewidth=0.8, linestyle="dotted")
-            row[2].set(title="loss when left out", xlabel="demonstration", ylabel="of the empty concept's", xticks=[*numbers])
+            row[2].set(title="loss when left out", xlabel="demonstration", ylabel="of the unconditional loss", xticks=[*numbers])
             row[3].plot([*curve], [*curve.values()], ".-", color=GOOD)
             row[3].set(title="loss of those left out", xlabel="learned from", xticks=[*curve])
         for axes in row[2:] if check.left_out is None else ():
@@ -96,12 +96,12 @@ def check_figure(checks: Sequence[Check]) -> Figure:
     return figure
 
 
-def _behaviour(axes: Axes, check: Check, odd: set[int]) -> None:
+def _behaviour(axes: Axes, check: Check, outlier: set[int]) -> None:
     """Paths of the first two columns for 2 or 3 columns; else distances from the start over time, or single states."""
     demos = check.demonstrations
     scale = demos.states.flatten(0, 1).std(dim=0).clamp(min=1e-12)
     for number, (states, length) in enumerate(zip(demos.states, demos.lengths.tolist(), strict=True)):
-        colour = ODD if number in odd else GOOD
+        colour = OUTLYING if number in outlier else GOOD
         if states.shape[1] in (2, 3) and length > 1:
             axes.plot(*states[:length, :2].T.numpy(), color=colour, linewidth=1)
             where = states[length - 1, :2].tolist()

@@ -41,7 +41,7 @@ SPARE = ("#117733", "#ddcc77", "#88ccee", "#555555")
 COLOURS = (*dict.fromkeys(OF_METHODS.values()), *SPARE)  # colours in order, for lines that are not methods
 PAPER_COLOUR = "#9a9a9a"
 LINES = ("dotted", "dashed", "dashdot", (0, (1, 4)), (0, (6, 2, 1, 2, 1, 2)), "solid")  # line styles of reference policies
-REFERENCE_MARKS = {REPLAYED: "X", FRESH: "*"}  # markers of the reference lines of novelty and coverage
+REFERENCE_MARKS = {REPLAYED: "X", FRESH: "*"}  # markers of the references of novelty and coverage
 WIDEST = 60.0  # maximum width of a figure in inches; a figure of thousands of settings would fill the memory
 
 
@@ -86,7 +86,7 @@ def _label_bars(axes: Axes, places: Sequence[float], shown: Sequence[str], metri
 
 
 def accuracy_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy") -> Figure:
-    """Plot a metric of every setting beside the paper's numbers and reference lines, for K = 2, else the K with most rows. Error
+    """Plot a metric of every setting beside the paper's numbers and references, for K = 2, else the K with most rows. Error
     bars are standard errors over tasks. ``results`` are rows of a results file.
     """
     rows = labelled(latest(select(results, domain=domain.name, metric=metric)))
@@ -115,7 +115,7 @@ def accuracy_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy
 
 
 def comparison_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy") -> Figure:
-    """Plot a metric of every setting for ours and the baselines, with reference lines and the paper's numbers as diamonds. Error
+    """Plot a metric of every setting for ours and the baselines, with references and the paper's numbers as diamonds. Error
     bars are standard errors over tasks. ``results`` are rows of a comparison.
     """
     rows = compared(domain, results)
@@ -153,7 +153,7 @@ ROW = 0.5  # height of a line of the overview in inches
 
 def overview_dots(results: pd.DataFrame) -> Figure:
     """Plot all domains, settings and metrics of a comparison: a marker for each method, with standard errors over tasks. Open
-    diamonds are the paper's numbers of the same method; ticks are reference lines. Our forms are limited to the paper's,
+    diamonds are the paper's numbers of the same method; ticks are references. Our forms are limited to the paper's,
     automatically chosen forms and the default forms of the domains. Rows are those of
     :func:`~ftl_lightning.reporting.comparison.all_methods`.
     """
@@ -177,7 +177,7 @@ def overview_dots(results: pd.DataFrame) -> Figure:
         for index, label in enumerate(series)
     }
     handles["the paper's"] = Line2D([], [], color="black", marker="D", markerfacecolor="none", linestyle="", markersize=5)
-    handles["reference lines"] = Line2D([], [], color="black", marker="|", linestyle="", markersize=8)
+    handles["references"] = Line2D([], [], color="black", marker="|", linestyle="", markersize=8)
     legend.legend(list(handles.values()), list(map(figure_text, handles)), fontsize=8, loc="center", ncols=4, frameon=False)
     return figure
 
@@ -199,7 +199,7 @@ def _dots(
     series: Mapping[str, Sequence[Compared]],
     colour_of: Mapping[str, str],
 ) -> None:
-    """Draw the panel of a domain, the first line on top; each line has its name, reference lines, and methods below each other."""
+    """Draw the panel of a domain, the first line on top; each line has its name, references, and methods below each other."""
     domain = lines[0][0]
     rows, references = compared(domain, results), reference_lines(domain, results)
     for place, (_, setting, metric) in enumerate(lines):
@@ -256,7 +256,7 @@ def growth(domain: Domain, results: pd.DataFrame) -> Figure:
 def frontier(domain: Domain, rows: pd.DataFrame) -> Figure:
     """Plot accuracy over coverage for each suite and setting: a line for each method, temperature from dark to light. Points are
     means over tasks and seeds. Less coverage is better, so better methods lie further up and to the left. Crosses and stars are the
-    reference lines *demonstrations replayed* and *fresh samples*. Rows are those of
+    references *demonstrations replayed* and *fresh samples*. Rows are those of
     :func:`~ftl_lightning.reporting.measurements.read_frontier`.
     """
     rows = rows[rows["domain"] == domain.name].dropna(subset=["accuracy", "coverage"])

@@ -29,7 +29,7 @@ WITHIN = 0.02  # tolerance below the final accuracy that counts as reached
 FRONTIER = "frontier.json"
 """File of accuracy over coverage in a folder of results; ``benchmarks/experiments/frontier.py`` writes it."""
 NOISY = "demonstrations with noise"
-"""Reference line without learning; its temperature is the noise, as a share of the demonstrations' standard deviation."""
+"""Reference without learning; its temperature is the noise, as a share of the demonstrations' standard deviation."""
 
 
 def _read(path: str | Path, name: str, key: str, kind: Callable[..., T], expected: str) -> list[T]:
@@ -88,7 +88,7 @@ class _FrontierRow:
     method: str
     form: str = ""
     variant: str = ""
-    temperature: float = math.nan  # missing for reference lines and methods without temperature
+    temperature: float = math.nan  # missing for references and methods without temperature
     seed: int
     n: int
     accuracy: float = math.nan  # the domain's main metric

@@ -118,7 +118,7 @@ function overview() {
     svg.append(name);
     svg.append(drawn("text", { x: 4, y: y + 15, class: "soft", style: "font-size:9px" }, line.metric + (line.less ? " (less is better)" : "")));
     for (const [name, mean] of Object.entries(line.references)) {
-      svg.append(named(drawn("rect", { x: x(mean) - 1.5, y: y - 10, width: 3, height: 20, fill: "#9aa4ae" }), `${name}: ${two(mean)} (reference line)`));
+      svg.append(named(drawn("rect", { x: x(mean) - 1.5, y: y - 10, width: 3, height: 20, fill: "#9aa4ae" }), `${name}: ${two(mean)} (reference)`));
     }
     line.methods.filter(({ method }) => !hidden.has(method)).forEach(({ method, mean, error, paper }, place, all) => {
       const at = y + (place - (all.length - 1) / 2) * Math.min(4, 20 / all.length), colour = data.colours[method];

@@ -70,7 +70,7 @@ def _title(domain: Domain) -> str:
 
 
 def _line(domain: Domain, setting: str, metric: str, results: pd.DataFrame) -> dict[str, Any]:
-    """Means of methods and reference lines."""
+    """Means of methods and references."""
     rows = compared(domain, results)
     measured, references = (select(table, setting=setting, metric=metric) for table in (rows, reference_lines(domain, results)))
     means = []

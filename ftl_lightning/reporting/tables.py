@@ -69,13 +69,13 @@ def _table(
 def _references(
     domain: Domain, name: str, caption: str, heads: Sequence[str], subjects: Sequence[tuple[Sequence[str], pd.DataFrame]]
 ) -> Table:
-    """The table of reference lines that accompanies the table ``name``; subjects are first cells and labelled rows."""
+    """The table of references that accompanies the table ``name``; subjects are first cells and labelled rows."""
     lines = [
         [*first, str(label), _cell(rows)]
         for first, subject_rows in subjects
         for label, rows in select(subject_rows, role=REFERENCE).groupby("label")
     ]
-    return make_table(domain, f"{name}_references", f"{caption}: reference lines", lines, [*heads, "reference line", "measured"])
+    return make_table(domain, f"{name}_references", f"{caption}: references", lines, [*heads, "reference", "measured"])
 
 
 def weighting(components: int, omega: str) -> str:
@@ -121,7 +121,7 @@ def main_rows(rows: pd.DataFrame, omega: str) -> tuple[pd.DataFrame, str]:
 
 
 def as_learned_most(domain: Domain, rows: pd.DataFrame) -> pd.DataFrame:
-    """Rows of a single configuration for each method, form and setting, and all reference lines. The guidance weight is that of the
+    """Rows of a single configuration for each method, form and setting, and all references. The guidance weight is that of the
     main tables (:func:`main_rows`). Variant and number of demonstrations are the most measured; ties go to more demonstrations.
     """
     chosen, _ = main_rows(labelled(latest(rows)), main_omega(domain))
@@ -134,7 +134,7 @@ def as_learned_most(domain: Domain, rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def tables(domain: Domain, results: pd.DataFrame) -> list[Table]:
-    """All tables of a domain that have results, with separate tables of reference lines."""
+    """All tables of a domain that have results, with separate tables of references."""
     rows = labelled(latest(select(results, domain=domain.name)))
     metric = domain.main_metric
     ours = of_method(rows, PAPERS_METHOD)

@@ -10,14 +10,14 @@ from torch import Tensor
 
 from ftl_lightning.data.check import Finding, axes, check
 from ftl_lightning.data.demonstrations import Demonstrations, paths_of
-from ftl_lightning.data.enough import Enough, Oddness
+from ftl_lightning.data.enough import Enough, Outliers
 from ftl_lightning.data.features import moved
 from ftl_lightning.data.references import NAMES
 from ftl_lightning.igm.concept import KNOWN, Concept
 from ftl_lightning.igm.explanation import formula
 from ftl_lightning.igm.forms.choice import LEARNED, combined, learn
 from ftl_lightning.igm.forms.combination import Combination
-from ftl_lightning.igm.forms.leave_one_out import LeaveOneOut, leave_one_out, odd_one, relative_losses
+from ftl_lightning.igm.forms.leave_one_out import LeaveOneOut, find_outlier, leave_one_out, relative_losses
 from ftl_lightning.igm.settings import AUTO, InversionSettings
 from ftl_lightning.services.errors import about, require, short
 from ftl_lightning.services.progress import bar
@@ -25,7 +25,7 @@ from ftl_lightning.services.text import alike, counted
 from ftl_lightning.training.concept_model import ConceptModel
 
 MARGIN, MOST_OF = 0.97, 0.8
-"""Maximum loss, relative to the unconditional (empty concept's) loss, of a demonstration that a training concept explains; minimum
+"""Maximum loss, relative to the unconditional loss, of a demonstration that a training concept explains; minimum
 share of explained demonstrations for a known task.
 """
 MOST_FAULTS = 6
@@ -63,8 +63,8 @@ class Known:
     def __str__(self) -> str:
         mean = sum(self.losses) / len(self.losses)
         if self.own:
-            return f"known: by its loss, {mean:.2f} of the empty concept's, {self.text!r} is the nearest training concept"
-        best = f"{self.text!r} ({self.count} of {len(self.losses)}, loss {mean:.2f} of the empty concept's)"
+            return f"known: by its loss, {mean:.2f} of the unconditional loss, {self.text!r} is the nearest training concept"
+        best = f"{self.text!r} ({self.count} of {len(self.losses)}, loss {mean:.2f} of the unconditional loss)"
         if self.clear:
             return f"known: the model already explains them as {best}; if that is all you mean, no learning is needed"
         return f"known: no training concept explains them all; the best is {best}"
@@ -180,13 +180,14 @@ def check_with(
     titled, total = f"{name}: training concepts", len(model.config.training_concepts)
     with bar(titled, total, lines=False) if progress else nothing as advance:
         known = known_as(model, demonstrations, settings, advance)
-    own, left, learned, odd = model.examples, None, None, None
-    if own is not None and (odd := Oddness(own, model.horizon, model.places).odd(demonstrations)) is not None:
-        faults = (*faults, Finding("differs from the others more than is usual within a concept; another concept?", rows=(odd,)))
+    own, left, learned, outlier = model.examples, None, None, None
+    if own is not None and (outlier := Outliers(own, model.horizon, model.places).outlier(demonstrations)) is not None:
+        text = "differs from the others more than is usual within a concept; another concept?"
+        faults = (*faults, Finding(text, rows=(outlier,)))
     if steps and len(demonstrations) > 1:
-        find_odd = odd_one if own is None else lambda losses: odd
+        find = find_outlier if own is None else lambda losses: outlier
         with bar(f"{name}: learning from some", steps) if progress else nothing as advance:
-            left = leave_one_out(model, demonstrations, settings, steps, lambda loss: advance(1, f"loss {loss:.3g}"), find_odd)
+            left = leave_one_out(model, demonstrations, settings, steps, lambda loss: advance(1, f"loss {loss:.3g}"), find)
         learned = None if own is None else _best_learned(model, demonstrations, settings, steps)
     enough = None if own is None else Enough.of(demonstrations, model.horizon, own, learned, faulty(faults), model.places)
     ordered = tuple(sorted(faults, key=lambda finding: finding.severity == "note"))
@@ -218,7 +219,7 @@ def combination_line(model: ConceptModel, demonstrations: Demonstrations, settin
     text = formula(sets.embeddings, sets.weights, model.config.training_concepts, model.training_embeddings.cpu())
     loss = float(combination.left_out.mean())
     verdict = "explains" if loss <= MARGIN else "does not explain"
-    unseen = f"demonstrations that its weights were not learned from (loss {loss:.2f} of the empty concept's)"
+    unseen = f"demonstrations that its weights were not learned from (loss {loss:.2f} of the unconditional loss)"
     return f"sum: {short(text, 120)} {verdict} {unseen}"
 
 

@@ -1,4 +1,4 @@
-"""Whether a few demonstrations suffice, and which of them is odd, by energy scores."""
+"""Whether a few demonstrations suffice, and which of them is an outlier, by energy scores."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import torch
 
 from ftl_lightning.apps.benchmark.strokes import TRAINING, strokes
 from ftl_lightning.data.demonstrations import Demonstrations, concatenate
-from ftl_lightning.data.enough import HIGH, Enough, Oddness
+from ftl_lightning.data.enough import HIGH, Enough, Outliers
 from tests.conftest import succeed
 
 
@@ -29,26 +29,26 @@ def training() -> Demonstrations:
 
 
 def test_an_exchanged_demonstration_is_named_at_any_place_and_a_good_set_is_not_blamed(training: Demonstrations) -> None:
-    oddness = Oddness(training, training.states.shape[1])
+    score = Outliers(training, training.states.shape[1])
     for seed in range(4):
         good = drawn("heart", 5, seed)
-        assert oddness.odd(good) is None
+        assert score.outlier(good) is None
         other = drawn(("S-curve", TRAINING[seed])[seed % 2], 1, seed, "heart")
         rows = [good.rows([row]) for row in range(5)]
         rows[seed] = other
-        assert oddness.odd(concatenate(rows)) == seed
-    assert oddness.odd(good.rows([0, 1])) is None  # two do not show which is odd
-    single = Oddness(drawn("circle", 10), training.states.shape[1])
-    assert single.odd(good) is None  # nothing to compare with
+        assert score.outlier(concatenate(rows)) == seed
+    assert score.outlier(good.rows([0, 1])) is None  # two do not show which is the outlier
+    single = Outliers(drawn("circle", 10), training.states.shape[1])
+    assert single.outlier(good) is None  # nothing to compare with
 
 
 def test_what_goes_to_another_share_of_the_way_to_a_place_is_odd() -> None:
     known = concatenate([to_place(8, number, share, f"{share}") for number, share in enumerate((-0.5, 0.2, 1.0, 1.4))])
-    oddness = Oddness(known, 12)
-    assert dict(oddness.setting.places)
+    score = Outliers(known, 12)
+    assert dict(score.setting.places)
     good = to_place(5, 20, 0.6, "new")
-    assert oddness.odd(good) is None
-    assert oddness.odd(concatenate([good.rows(range(4)), to_place(1, 21, -0.5, "new")])) == 4
+    assert score.outlier(good) is None
+    assert score.outlier(concatenate([good.rows(range(4)), to_place(1, 21, -0.5, "new")])) == 4
 
 
 def test_five_alike_suffice_and_few_that_differ_in_kind_do_not(training: Demonstrations) -> None:
@@ -104,8 +104,8 @@ def test_check_says_whether_they_suffice_without_the_odd_one(capsys: pytest.Capt
     assert "these suffice" in out
     states = good.states.clone()
     states[2] = torch.from_numpy(strokes("square", 1, 3)[0])
-    Demonstrations.of(list(states.numpy()), "heart").save("odd.npz")
-    out = checked("odd.npz")
+    Demonstrations.of(list(states.numpy()), "heart").save("outlier.npz")
+    out = checked("outlier.npz")
     assert "demonstration 3: moves otherwise than the others" in out
     assert "enough: without demonstration 3, " in out
     good.rows([0, 1]).save("two.npz")
@@ -120,8 +120,8 @@ def test_check_says_whether_they_suffice_without_the_odd_one(capsys: pytest.Capt
 def test_a_model_of_own_data_names_the_odd_one_and_judges_the_others(capsys: pytest.CaptureFixture[str]) -> None:
     states = drawn("heart", 5, 1).states.numpy().copy()
     states[2] = strokes("S-curve", 1, 3)[0]
-    Demonstrations.of(list(states), "heart").save("odd.npz")
-    succeed("check", "odd.npz", "--pretrained", "strokes")
+    Demonstrations.of(list(states), "heart").save("outlier.npz")
+    succeed("check", "outlier.npz", "--pretrained", "strokes")
     out = capsys.readouterr().out
     assert "warning: demonstration 3: differs from the others more than is usual within a concept; another concept?" in out
     assert "enough: without demonstration 3, " in out

@@ -123,8 +123,8 @@ def test_a_rarely_used_column_makes_no_outlier_of_a_good_demonstration() -> None
     states[40, 3, 0] = 0.5
     assert not [finding for finding in check(Demonstrations.of(list(states), "four")) if finding.severity != "note"]
     states[40] += 30
-    (odd,) = [finding for finding in check(Demonstrations.of(list(states), "four")) if finding.severity != "note"]
-    assert odd.rows == (40,)
+    (outlier,) = [finding for finding in check(Demonstrations.of(list(states), "four")) if finding.severity != "note"]
+    assert outlier.rows == (40,)
 
 
 @pytest.mark.parametrize("count", [5, 8, 10])

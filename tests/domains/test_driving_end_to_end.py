@@ -61,7 +61,7 @@ def test_the_shipped_demonstrations() -> None:
 @pytest.mark.slow
 @pytest.mark.usefixtures("short_sighted")
 def test_invert_learns_the_roundabout_and_drives_it(tiny_of: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Inverting again, with another K, drives none of the reference lines again."""
+    """Inverting again, with another K, drives none of the references again."""
     monkeypatch.setattr("ftl_lightning.domains.driving.rendering.BETWEEN", 1)
     made: list[str] = []
 

@@ -8,7 +8,7 @@ USUAL: dict[str, Any] = {"domain": "object_rearrangement", "setting": "new conce
 USUAL |= {"variant": "free", "omega": "1.2", "demonstrations": 5, "seed": 0, "n": 50, "metric": "accuracy", "value": 0.5}
 USUAL |= {"model_hash": "m", "config_hash": "c"}
 REFERENCE: dict[str, Any] = {"variant": "", "role": "reference", "K": 0, "omega": ""}
-"""What is different in a reference line, beside its name."""
+"""What is different in a reference, beside its name."""
 
 
 def row(**changes: Any) -> Row:

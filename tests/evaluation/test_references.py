@@ -1,4 +1,4 @@
-"""Novelty, coverage and their reference lines."""
+"""Novelty, coverage and their references."""
 
 from dataclasses import replace
 from pathlib import Path

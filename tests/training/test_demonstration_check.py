@@ -13,7 +13,7 @@ from ftl_lightning.apps.benchmark.strokes import strokes
 from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.few_shot.learner import FewShot
-from ftl_lightning.igm.forms.leave_one_out import LeaveOneOut, leave_one_out, odd_one, relative_losses, subsets
+from ftl_lightning.igm.forms.leave_one_out import LeaveOneOut, find_outlier, leave_one_out, relative_losses, subsets
 from ftl_lightning.reporting.concept_figures import check_figure
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.training.checks import Known, scale_findings, warnings_of
@@ -95,11 +95,11 @@ def test_subsets_hold_each_demonstration_equally_often(count: int) -> None:
 
 
 def test_the_odd_one_is_far_above_all_others() -> None:
-    assert odd_one(torch.tensor([0.5, 0.4, 1.9, 0.6])) == 2
-    assert odd_one(torch.tensor([0.5, 0.4, 0.7, 0.6])) is None
-    assert odd_one(torch.tensor([1.0, 0.9, 1.1, 1.7])) is None
-    assert odd_one(torch.tensor([0.2, 0.9, 0.2])) is None  # it is still explained better than by nothing
-    assert odd_one(torch.tensor([0.2, 2.0])) is None
+    assert find_outlier(torch.tensor([0.5, 0.4, 1.9, 0.6])) == 2
+    assert find_outlier(torch.tensor([0.5, 0.4, 0.7, 0.6])) is None
+    assert find_outlier(torch.tensor([1.0, 0.9, 1.1, 1.7])) is None
+    assert find_outlier(torch.tensor([0.2, 0.9, 0.2])) is None  # it is still explained better than by nothing
+    assert find_outlier(torch.tensor([0.2, 2.0])) is None
 
 
 def test_words_follow_the_numbers() -> None:
@@ -111,9 +111,9 @@ def test_words_follow_the_numbers() -> None:
     more = LeaveOneOut((0.4, 0.5, 1.9), (0.3, 0.3, 0.4), {1: 0.9, 2: 0.7}, 2, 0.02)
     assert more.falling
     assert suffice.lines()[-1].startswith("distance: where it is learned from them, they have 3.3 times")
-    assert more.far  # without the odd one
+    assert more.far  # without the outlier
     assert more.lines()[-1].startswith("far: where it is learned from them, they have 15.0 times")
-    assert "odd: demonstration 3, loss 1.90" in " ".join(more.lines())
+    assert "outlier: demonstration 3, loss 1.90" in " ".join(more.lines())
     assert "more are likely to help" in " ".join(more.lines())
     assert "look at samples" in LeaveOneOut((1.0, 1.1, 1.0), (0.8, 0.8, 0.8), {1: 1.05, 2: 1.03}, None, 0.2).lines()[-2]
     assert not Known("a", (0.9, 0.9, 1.2, 0.9)).clear
@@ -129,7 +129,7 @@ def test_a_stroke_of_another_kind_is_odd() -> None:
     assert found.left_out[4] == max(found.left_out)
     assert found.left_out[4] > 1.5 * sorted(found.left_out)[-2]
     fine = leave_one_out(model.model, good, model.tuned.inversion, 60)
-    assert fine.odd is None
+    assert fine.outlier is None
     assert sum(fine.left_out) / 5 < 1
     assert not fine.far
 

@@ -76,7 +76,7 @@ def held_out_loss(model: ConceptModel, concept: Composition, drives: Demonstrati
 def policies(
     few: FewShot, task: str, concepts: Mapping[str, Composition], shown: Demonstrations, starts: InitialStates, seed: int
 ) -> dict[str, Policy]:
-    """What is asked, by name: plans of concepts, and reference lines."""
+    """What is asked, by name: plans of concepts, and references."""
     model, loop = few.model, DOMAIN.closed_loop
     assert loop is not None
     found: dict[str, Policy] = {}

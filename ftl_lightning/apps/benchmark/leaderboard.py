@@ -1,4 +1,4 @@
-"""Leaderboard page from a folder of submissions, with reference lines: committed scores, which no submission changes."""
+"""Leaderboard page from a folder of submissions, with references: committed scores, which no submission changes."""
 
 import dataclasses
 import json
@@ -23,7 +23,7 @@ MARK = "≈"  # mark of methods whose numbers cannot be recomputed to the digit
 HEAD = """# Leaderboard
 
 This page is made by `ftl-lightning benchmark --leaderboard docs/leaderboard.md` from the files in `results/submissions`,
-each of which passes `benchmark --check`. Reference lines, in italics, were computed by this package; no submission changes them.
+each of which passes `benchmark --check`. References, in italics, were computed by this package; no submission changes them.
 [The protocol](benchmark.md) says what the numbers mean and how to add a line.
 """
 

@@ -44,7 +44,7 @@ MODE_SAMPLES, MODE_STEPS = 16, 400
 """Noised demonstrations a step, and maximum number of steps, of modes without an adapter."""
 FOLDS, CLEAR, FEWER = 5, 0.4, 2
 """Maximum number of leave-one-out folds; relative loss of one set below which it suffices, so that folds only decide about
-composition; number of folds then. Losses are relative to the unconditional (empty concept's) loss.
+composition; number of folds then. Losses are relative to the unconditional loss.
 """
 TOLERANCE = 0.01
 """Default tolerance of early stopping."""
@@ -399,9 +399,9 @@ def _narrowed(model: Invertible, demonstrations: Demonstrations, concept: Concep
 
 def _choice(shares: _Shares, qualities: Mapping[str, Quality]) -> tuple[str, str]:
     """The selected form and its reason."""
-    losses = f"{shares.own:.2f} of the empty concept's"
+    losses = f"{shares.own:.2f} of the unconditional loss"
     if shares.left_out is not None:
-        losses = f"{shares.left_out:.2f} of the empty concept's on left-out demonstrations, {shares.own:.2f} on its own"
+        losses = f"{shares.left_out:.2f} of the unconditional loss on left-out demonstrations, {shares.own:.2f} on its own"
     if not shares.suffices:
         return MODES, f"one set of embeddings does not explain the demonstrations (loss {losses}), so samples stay close to them"
     because, spread = f"one set of embeddings explains the demonstrations (loss {losses})", qualities[ADAPTED].spread

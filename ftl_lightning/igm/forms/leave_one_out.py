@@ -20,8 +20,8 @@ MOST = 12
 """Maximum number of demonstrations; several concepts are learned for each."""
 SAMPLES, TOLERANCE = 16, 0.03
 """Fast learning: noised demonstrations a step, and stopping tolerance."""
-ODD, HARMED = 1.7, 1.2
-"""Minimum ratios of an odd demonstration's left-out loss to the largest other loss, and to the unconditional loss."""
+OUTLYING, HARMED = 1.7, 1.2
+"""Minimum ratios of an outlier's left-out loss to the largest other loss, and to the unconditional loss."""
 COVERED = 0.95
 """Relative loss below which a demonstration is explained."""
 FAR = 10.0
@@ -128,29 +128,29 @@ def _samples(settings: InversionSettings) -> int:
 
 @dataclass(frozen=True)
 class LeaveOneOut:
-    """Losses of demonstrations relative to the unconditional (empty concept's) loss on the same noise; lower is better.
+    """Losses of demonstrations relative to the unconditional loss on the same noise; lower is better.
 
     Attributes:
         left_out: left-out loss of each demonstration ``(demo,)``, under the concept learned from all others.
         learned_from: training loss of each demonstration ``(demo,)``, the mean over concepts that leave another one out.
-        curve: mean left-out loss by the number of training demonstrations, without the odd demonstration.
-        odd: index of the demonstration that differs from the others; ``None`` without any.
+        curve: mean left-out loss by the number of training demonstrations, without the outlier.
+        outlier: index of the demonstration that differs from the others; ``None`` without any.
         generated: loss of generated behaviour, see :func:`generated_loss`.
     """
 
     left_out: tuple[float, ...]
     learned_from: tuple[float, ...]
     curve: dict[int, float]
-    odd: int | None
+    outlier: int | None
     generated: float
 
     @property
     def distance(self) -> float:
-        """Ratio of the training loss, without the odd demonstration, to the loss of generated behaviour.
+        """Ratio of the training loss, without the outlier, to the loss of generated behaviour.
 
         The left-out loss is also large for too few demonstrations.
         """
-        kept = [loss for row, loss in enumerate(self.learned_from) if row != self.odd]
+        kept = [loss for row, loss in enumerate(self.learned_from) if row != self.outlier]
         return sum(kept) / len(kept) / max(self.generated, 1e-12)
 
     @property
@@ -176,13 +176,12 @@ class LeaveOneOut:
         summary = f"left out: the concept learned from the others explains {self.covered} of {count}"
         missed = [row for row, loss in enumerate(self.left_out) if loss >= COVERED]
         summary += f", not {numbered(missed)}" if 0 < len(missed) < count else ""
-        summary += f" (loss {out:.2f} of the empty"
-        summary += f" concept's, {inside:.2f} where it is learned from, too)" if count > 2 else " concept's)"
-        odd = "odd: none is explained much worse than the others"
-        if self.odd is not None:
-            others = max(loss for row, loss in enumerate(self.left_out) if row != self.odd)
-            odd = f"odd: demonstration {self.odd + 1}, loss {self.left_out[self.odd]:.2f} when it is left out (others at most"
-            odd += f" {others:.2f}); another concept, or a mistake?"
+        summary += f" (relative loss {out:.2f}{f', in learning {inside:.2f}' if count > 2 else ''})"
+        outlier = "outlier: none is explained much worse than the others"
+        if self.outlier is not None:
+            loss, others = self.left_out[self.outlier], [loss for row, loss in enumerate(self.left_out) if row != self.outlier]
+            outlier = f"outlier: demonstration {self.outlier + 1}, loss {loss:.2f} when it is left out"
+            outlier += f" (others at most {max(others):.2f}); another concept, or a mistake?"
         curve = ", ".join(f"{loss:.2f} from {size}" for size, loss in self.curve.items())
         verdict = "still falls: more are likely to help" if self.falling else "hardly falls any more: these suffice"
         if not self.falling and [1.0, *self.curve.values()][-1] >= COVERED:
@@ -191,7 +190,7 @@ class LeaveOneOut:
         times = f"where it is learned from them, they have {self.distance:.1f} times the loss of what the model generates"
         near = f"distance: {times} (from {FAR:.0f} on: far from anything pretrained)"
         far = f"far: {times}: nothing pretrained is like this; look at samples, they may do something else"
-        return [summary, *([odd] if count > 2 else []), more, far if self.far else near]
+        return [summary, *([outlier] if count > 2 else []), more, far if self.far else near]
 
 
 def subsets(count: int) -> list[tuple[int, ...]]:
@@ -238,13 +237,13 @@ def quickly(settings: InversionSettings) -> InversionSettings:
     )
 
 
-def odd_one(losses: Tensor) -> int | None:
+def find_outlier(losses: Tensor) -> int | None:
     """Index of the demonstration with a left-out loss ``(demo,)`` far above the others'; ``None`` without any."""
     if len(losses) < 3:
         return None
     worst = int(losses.argmax())
     others = torch.cat((losses[:worst], losses[worst + 1 :]))
-    return worst if losses[worst] > max(ODD * float(others.max()), HARMED) else None
+    return worst if losses[worst] > max(OUTLYING * float(others.max()), HARMED) else None
 
 
 def leave_one_out(
@@ -253,14 +252,14 @@ def leave_one_out(
     settings: InversionSettings,
     steps: int,
     tell: Tell = lambda loss: None,
-    find_odd: Callable[[Tensor], int | None] = odd_one,
+    find: Callable[[Tensor], int | None] = find_outlier,
 ) -> LeaveOneOut:
     """Learn the concept from subsets, in one batch, and measure each on the left-out demonstrations.
 
     Args:
         demonstrations: two or more of one concept; the first :data:`MOST` are used.
         settings: settings of the inversion; modes, adapters and restarts are ignored.
-        find_odd: index of the odd demonstration by the left-out losses ``(demo,)``, or ``None``.
+        find: index of the outlier by the left-out losses ``(demo,)``, or ``None``.
     """
     count = min(len(demonstrations), MOST)
     used, chosen = demonstrations.rows(list(range(count))), subsets(count)
@@ -270,14 +269,14 @@ def leave_one_out(
     last = sizes == count - 1
     outside = torch.where(without[last], losses[last], 0).sum(dim=0)
     inside = torch.where(~without[last], losses[last], 0).sum(dim=0) / max(count - 1, 1)
-    odd = find_odd(outside)
+    outlier = find(outside)
     kept = without.clone()
-    if odd is not None:
-        kept[:, odd] = False
-        kept[~without[:, odd]] = False  # concepts learned from it
+    if outlier is not None:
+        kept[:, outlier] = False
+        kept[~without[:, outlier]] = False  # concepts learned from it
     curve = {
         size: float(losses[sizes == size][kept[sizes == size]].mean())
         for size in sorted(set(sizes.tolist()))
         if kept[sizes == size].any()
     }
-    return LeaveOneOut(tuple(outside.tolist()), tuple(inside.tolist()), curve, odd, generated_loss(model, used, settings))
+    return LeaveOneOut(tuple(outside.tolist()), tuple(inside.tolist()), curve, outlier, generated_loss(model, used, settings))

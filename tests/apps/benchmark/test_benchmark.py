@@ -292,7 +292,7 @@ def test_no_submission_changes_a_reference_line(copy: Path) -> None:
 
 
 def committed_references(name: str) -> list[str]:
-    """Reference lines of a suite on the committed page, highest first."""
+    """References of a suite on the committed page, highest first."""
     suite = load_suite(name)
     section = (
         (ROOT / "docs" / "leaderboard.md").read_text(encoding="utf-8").partition(f"## {suite.title}\n")[2].partition("\n## ")[0]
