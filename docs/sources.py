@@ -20,18 +20,18 @@ import pandas as pd
 import yaml
 from safetensors import safe_open
 
+from ftl_lightning.apps.paper import measured
 from ftl_lightning.domains.comparison import OURS, Compared
 from ftl_lightning.domains.registry import domain_of_file
 from ftl_lightning.evaluation.results import latest, read_rows
 from ftl_lightning.few_shot.tuned import ModelSettings
 from ftl_lightning.reporting.paired import mcnemar, up
-from ftl_lightning.reporting.table import Number, lookup, select, summarise
+from ftl_lightning.reporting.table import lookup, select
 from ftl_lightning.reporting.tables import against
 from ftl_lightning.services.configuration import load
+from ftl_lightning.services.errors import UserError as SourceError
 
 ROOT = Path(__file__).parent.parent
-ONE_OF = ("setting", "metric", "method", "form", "variant", "K", "omega")
-"""Columns in which rows behind one number must be alike."""
 EVERY = "*"
 """In place of a column's value or of a key: each that there is."""
 READERS: Mapping[str, Callable[[str], Any]] = {
@@ -63,32 +63,6 @@ COMBINED: Mapping[str, Callable[[list[float]], float]] = {
 """Numbers that are made of several."""
 
 _table, _tuned = cache(read_rows), cache(ModelSettings.read)
-
-
-class SourceError(Exception):
-    """A reference that comes to nothing; the message says what was expected."""
-
-
-def measured(rows: pd.DataFrame, chosen: Mapping[str, Any]) -> Number:
-    """The number behind rows that have these values in their columns.
-
-    Raises:
-        SourceError: if there are none, or rows of several settings.
-    """
-    found = _alike(rows, chosen)
-    number = summarise(found)
-    assert number is not None  # some rows were found
-    return number
-
-
-def _alike(rows: pd.DataFrame, chosen: Mapping[str, Any]) -> pd.DataFrame:
-    found = latest(select(rows, **chosen))
-    if found.empty:
-        raise SourceError(f"expected rows with {dict(chosen)}, found none")
-    for column in ONE_OF:
-        if len(set(found[column])) > 1:
-            raise SourceError(f"expected rows of one {column}, found {sorted(set(map(str, found[column])))}")
-    return found
 
 
 def values(reference: Mapping[str, Any]) -> list[float]:
@@ -135,7 +109,7 @@ def _each(rows: pd.DataFrame, chosen: Mapping[str, Any]) -> Iterator[Mapping[str
 
 def _number(rows: pd.DataFrame, chosen: Mapping[str, Any], rest: Mapping[str, Any]) -> float:
     if "against" not in rest:
-        return getattr(measured(rows, chosen), rest.get("of", "mean"))
+        return getattr(measured(rows, chosen, "rows"), rest.get("of", "mean"))
     counts = against(latest(select(rows, **chosen)), rest["against"])
     if counts is None:
         raise SourceError(f"expected rows of episodes against {rest['against']!r} with {dict(chosen)}, found none")

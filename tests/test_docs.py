@@ -8,8 +8,8 @@ from statistics import mean, pstdev
 from typing import Any
 
 import pytest
-import yaml
 
+from ftl_lightning.apps.paper import items
 from ftl_lightning.cli.main import COMMANDS, TRAINER_VERBS
 from ftl_lightning.domains.registry import domain_of_file
 from ftl_lightning.reporting.table import plus_minus
@@ -197,12 +197,12 @@ def test_the_table_of_starts_is_what_was_measured() -> None:
 
 
 ONLY_PRINTED = {"0.32": "Section 5.1", "people 80 %": "Table 1", "people 40 %": "Table 1", "people 26.7 %": "Table 1"}
-"""The paper's numbers that stand beside ours in no table of a domain, as `docs/paper.yaml` has them, and where they are printed."""
+"""The paper's numbers that stand beside ours in no table of a domain, as `apps/paper.yaml` has them, and where they are printed."""
 
 
 def test_the_papers_numbers_on_its_page_are_those_of_the_domains() -> None:
     checked = 0
-    for item in yaml.safe_load((ROOT / "docs" / "paper.yaml").read_text(encoding="utf-8")):
+    for item in items():
         for name, papers, chosen in item.get("rows", ()):
             row = {**item.get("all", {}), **chosen}
             if not papers or papers in ONLY_PRINTED:
@@ -215,16 +215,6 @@ def test_the_papers_numbers_on_its_page_are_those_of_the_domains() -> None:
             assert papers in {plus_minus(one.value, one.error) for one in same}, f"{item['item']}, {name}"
             checked += 1
     assert checked > 30
-
-
-def test_the_page_of_the_paper_says_what_has_no_rows() -> None:
-    paper = runpy.run_path(str(ROOT / "docs" / "paper.py"))
-    rows = paper["read_rows"](ROOT / "results" / "tabletop.csv")
-    assert re.fullmatch(r"0\.\d\d.*", paper["shown"](rows, {"method": "BC", "metric": "closed loop success"}, "BC"))
-    with pytest.raises(SystemExit, match=r"BC: expected rows with .*, found none"):
-        paper["shown"](rows, {"method": "BC", "metric": "accuracy"}, "BC")
-    with pytest.raises(SystemExit, match="all: expected rows of one setting, found"):
-        paper["shown"](rows, {"method": "FTL-IGM", "metric": "closed loop success"}, "all")
 
 
 def test_the_notes_tell_how_well_the_judge_of_motion_recognises_unseen_people() -> None:

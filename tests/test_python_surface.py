@@ -266,7 +266,7 @@ WRONG: list[tuple[Callable[[Things], Any], str]] = [
     (lambda of: of.scenes[SCENE] * "2", "expected a number to multiply a concept with, found '2'"),
     (lambda of: float("nan") * of.scenes[SCENE], "weight: expected a finite number, found nan"),
     (lambda of: FewShot.from_pretrained("objectrearrangement"), "did you mean object_rearrangement"),
-    (lambda of: FewShot.from_pretrained("pretrained/agnt"), "did you mean agent? all that ship: ftl_lightning.list_models()"),
+    (lambda of: FewShot.from_pretrained("pretrained/agnt"), "did you mean agent? shipped models: ftl_lightning.list_models()"),
     (
         lambda of: FewShot.from_pretrained("chess"),
         "agent, driving, mocap, object_rearrangement, strokes, tabletop, tabletop_wide ship",
@@ -448,7 +448,7 @@ def test_longer_demonstrations_are_told_of(things: Things) -> None:
         "as 'world' is known at the first time alone"
     )
     assert longer_than_plans(shown([140, 100], True), model) == (
-        "demonstrations of up to 140 steps are longer than the model's horizon of 128: they are learned from in stretches of "
+        "demonstrations of up to 140 steps are longer than the model's horizon of 128: they are learned from in windows of "
         "128 steps, which start anywhere, mostly early; a plan has 128 steps"
     )
     driving = FewShot.from_pretrained("driving").model  # which plans anew
@@ -456,7 +456,7 @@ def test_longer_demonstrations_are_told_of(things: Things) -> None:
     assert longer.states.shape[1] > driving.window
     assert longer_than_plans(longer, driving) == ""
     unseen = replace(longer, observed={}, per_step=())
-    assert "in stretches of 8 steps, which start anywhere; a plan has 8 steps" in longer_than_plans(unseen, driving)
+    assert "in windows of 8 steps, which start anywhere; a plan has 8 steps" in longer_than_plans(unseen, driving)
 
 
 @pytest.mark.slow

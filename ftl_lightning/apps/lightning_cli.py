@@ -147,14 +147,14 @@ class CommandLine(LightningCLI):
     before_test = before_validate
 
     def before_fit(self) -> None:
-        """Resolve ``last`` to the path of the last checkpoint; without any, the run starts anew with a note."""
+        """Resolve ``last`` to the path of the last checkpoint; without any, the run starts from the beginning, with a note."""
         options = self.config_init[self._verb]
         if options.get("ckpt_path"):
             warnings.filterwarnings("ignore", message="Checkpoint directory .* exists and is not empty")  # as is meant
         if options.get("ckpt_path") == "last":
             options["ckpt_path"] = last_checkpoint(self.trainer)
             if options["ckpt_path"] is None and self._verb == "fit":
-                say(f"ckpt_path: no last checkpoint in {self.trainer.log_dir}; fit starts anew")
+                say(f"ckpt_path: no last checkpoint in {self.trainer.log_dir}; fit starts from the beginning")
 
     def _parse_ckpt_path(self) -> None:
         # Lightning would override configuration and command line by the checkpoint's hyper-parameters, class included.

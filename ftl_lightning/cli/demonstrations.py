@@ -74,7 +74,7 @@ def encode(domain: str, encoder: str = "minilm", revision: str = "main", out: st
     from ftl_lightning.networks.text_encoder import load_encoder, write_table
 
     concepts = load_domain(domain).concepts
-    require(out or concepts.table, "out", "a file to write", f"none: domain {domain} names no table of its own")
+    require(out or concepts.table, "out", "a file to write", f"none: domain {domain} names no table")
     path = Path(out) if out else Path(str(concepts.table))
     write_table(path, load_encoder(encoder, concepts.table, revision), concepts.descriptions)
     say(path)

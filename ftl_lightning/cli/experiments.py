@@ -124,8 +124,8 @@ def _named(text: str, key: str) -> list[str]:
 
 
 def _chosen(options: BenchmarkOptions) -> list[str]:
-    """The named suites, or all that the method can run here, with notes on the others. Raise UserError if a named one cannot be
-    run.
+    """The named suites, or every suite that the method can run here, with notes on the others. Raise UserError if a named suite
+    cannot be run.
     """
     from ftl_lightning.apps.benchmark.run import missing_of
     from ftl_lightning.apps.benchmark.suite import load_suite, suite_names
@@ -286,15 +286,34 @@ def ablate(options: AblateOptions) -> None:
         say("\n".join(write_scripts(options.slurm, stages, plan, keys, options.workers, options.sbatch)))
 
 
-def report(results: str = "results", out: str = "results/report", readme: str = "", html: str = "") -> None:
-    """Make tables and figures from results, with the paper's numbers; or an HTML page.
+def report(
+    results: str = "results",
+    out: str = "results/report",
+    readme: str = "",
+    html: str = "",
+    paper: str = "",
+    run: bool = False,
+    root: str = "",
+) -> None:
+    """Make tables and figures from results, with the paper's numbers; or an HTML page; or print a table or figure of the paper.
 
     Args:
         results: a results file, or a folder of results files.
         out: folder for Markdown, LaTeX and figures.
         readme: a Markdown file to update between its marks.
         html: HTML file to write instead: overview, films, concepts and curves, without a network.
+        paper: table, figure or claim of the paper to print instead, such as "Table 4"; "all" for all.
+        run: with ``paper``, measure its numbers again, into a subfolder of ``out``.
+        root: with ``run``, the folder of recordings, for human motion.
     """
+    if paper:
+        from ftl_lightning.apps.paper import items, measure_again, printed
+
+        chosen, folder = items("" if paper == "all" else paper), Path(results)
+        if run:
+            measure_again(chosen, folder, folder := Path(out) / "measured again", root)
+        say("\n\n".join(printed(item, folder) for item in chosen))
+        return
     if html:
         from ftl_lightning.reporting.page import write_page
 

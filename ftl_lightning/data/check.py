@@ -1,4 +1,4 @@
-"""Check a few demonstrations for faults that show without a model: missing values, jumps, still stretches, copies, outliers.
+"""Check a few demonstrations for faults that show without a model: missing values, jumps, standstills, copies, outliers.
 
 Thresholds were chosen on demonstrations of navigation, object rearrangement and driving, on pen strokes, noise and random walks: 99
 of 100 sets of three to ten good demonstrations pass (97 in driving).
@@ -444,7 +444,7 @@ def _wraps(states: Tensor, steps: list[Tensor]) -> bool:
 
 
 def _units(demonstrations: Demonstrations) -> Iterator[Finding]:
-    """Find demonstrations whose values are much larger or smaller than the others'."""
+    """Find demonstrations whose values are much larger or smaller than those of the other demonstrations."""
     paths = _paths(demonstrations)
     sizes = torch.stack([path.abs().amax(dim=0) for path in paths])
     varies = torch.cat(paths).std(dim=0, correction=0) > SAME * sizes.amax(dim=0)
@@ -453,7 +453,7 @@ def _units(demonstrations: Demonstrations) -> Iterator[Finding]:
         ratios = (sizes[row, varies].clamp(min=1e-30) / others).median(dim=1).values
         if ratios.min() > UNITS or ratios.max() < 1 / UNITS:
             ratio = float(ratios.median())
-            relation = f"{ratio:.0f} times the others'" if ratio > 1 else f"1/{1 / ratio:.0f} of the others'"
+            relation = f"{ratio:.0f} times the other values" if ratio > 1 else f"1/{1 / ratio:.0f} of the other values"
             yield Finding(f"its values are about {relation}; other units?", rows=(row,))
 
 
@@ -465,7 +465,7 @@ def _shapes(points: Tensor) -> Tensor:
 
 
 def _outliers(demonstrations: Demonstrations) -> Iterator[Finding]:
-    """Find demonstrations far from all others, relative to the others' distances."""
+    """Find demonstrations far from all others, relative to distances among the others."""
     count, points = len(demonstrations), _points(_paths(demonstrations))
     if count < 3:
         return

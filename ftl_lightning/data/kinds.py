@@ -392,7 +392,7 @@ def turn_of(unit: str) -> float:
 
 
 def _poses(first: int, free: int) -> Iterator[Group]:
-    """Poses that fit into ``free`` columns: homogeneous matrices of four rows, as they are or transposed, or of three rows."""
+    """Poses that fit into ``free`` columns: homogeneous matrices of four rows, also transposed, or of three rows."""
     yield from (Group(POSE, first, 16, (16.0, transposed)) for transposed in (0.0, 1.0) if free >= 16)
     if free >= 12:
         yield Group(POSE, first, 12, (12.0, 0.0))

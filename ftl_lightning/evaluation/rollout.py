@@ -38,7 +38,7 @@ SUCCESSES = ("is_success", "success")
 SIDE_BY_SIDE = 16
 """Maximum number of environments that are made."""
 LONGEST = 1000
-"""Maximum steps of an episode in an environment without a limit of its own."""
+"""Maximum steps of an episode in an environment that has no limit."""
 TIMED = 20
 """Number of chunks that measure the latency."""
 Z = 1.96

@@ -313,7 +313,7 @@ def changes_table(domain: Domain, results: pd.DataFrame) -> Table:
         for variant in dict.fromkeys(rows["variant"])
     ]
     caption = (
-        f"{domain.name}: {metric} of ours, and with one change to the paper's form taken away at a time. "
+        f"{domain.name}: {metric} of ours, and without one of our changes to the paper's form at a time. "
         "Mean ± standard error over tasks (spread over seeds)"
     )
     return make_table(None, "changes", caption, lines, ["variant", *columns])

@@ -44,7 +44,7 @@ def missing_model(place: str | Path) -> str:
     place = short(str(place), 80)
     normalised = place.lower().replace(" ", "_").replace("-", "_").removeprefix("pretrained/")
     near = difflib.get_close_matches(normalised, list_models(baselines=True), n=2)
-    ship = f"did you mean {' or '.join(near)}? all that ship:" if near else f"{', '.join(shipped_models())} ship, see"
+    ship = f"did you mean {' or '.join(near)}? shipped models:" if near else f"{', '.join(shipped_models())} ship, see"
     return (
         f"{Path(place) / 'config.json'}: expected a pretrained model, found nothing; {ship} ftl_lightning.list_models(); "
         "to make one, run: python -m ftl_lightning fit"

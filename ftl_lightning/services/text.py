@@ -157,7 +157,7 @@ def markdown(text: str) -> str:
 
 
 def markdown_item(text: str) -> str:
-    """:func:`markdown` for an item of a list, which begins no heading, line or list of its own."""
+    """:func:`markdown` for an item of a list, which begins no heading, line or list."""
     return _BEGINNING.sub(r"\1\\\2", markdown(text))
 
 

@@ -244,7 +244,7 @@ def longer_than_plans(demonstrations: Demonstrations, model: ConceptModel) -> st
     # The same exponent decides where windows start, see Demonstrations.starts.
     where = "anywhere" if plans.exponent(window) == 1 else "anywhere, mostly early"
     return (
-        f"{start} longer than the model's horizon of {window}: they are learned from in stretches of {window} steps, which start "
+        f"{start} longer than the model's horizon of {window}: they are learned from in windows of {window} steps, which start "
         f"{where}; a plan has {model.config.horizon} steps"
     )
 

@@ -36,7 +36,7 @@ def save_model(model: ConceptModel, folder: str | Path) -> None:
         UserError: before writing, for weights that are not finite or too large for half precision.
     """
     folder, stored = Path(folder), model.stored()
-    check_finite(stored, str(folder), "nothing was written; train it anew")
+    check_finite(stored, str(folder), "nothing was written; train it again")
     header = {"format": VERSION, "hash": model.hash, "kind": model.kind}
     with alone(folder):  # concurrent writes do not mix
         save_tensors(folder / WEIGHTS, KIND, stored, {"domain": model.config.domain})

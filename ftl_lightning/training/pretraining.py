@@ -77,8 +77,8 @@ class Pretraining(pl.LightningModule, ABC, Generic[M]):
             effector's pose with 0.4.
         privileged: loss weights by name: image encoders are trained to predict privileged information of training
             demonstrations, see :class:`~ftl_lightning.domains.domain.Privileged`; none for ``None``.
-        told: share of each step's windows whose image encoding is replaced by privileged information, which costs a fraction of
-            encoding the image.
+        unencoded: share of each step's windows whose image encoding is replaced by privileged information, which costs a fraction
+            of encoding the image.
 
     Raises:
         UserError: at construction, for a value out of its range.
@@ -117,7 +117,7 @@ class Pretraining(pl.LightningModule, ABC, Generic[M]):
         image_encoder: Mapping[str, Any] | None = None,
         feature_dropout: Mapping[str, float] | None = None,
         privileged: Mapping[str, float] | None = None,
-        told: float = 0.0,
+        unencoded: float = 0.0,
     ) -> None:
         super().__init__()
         self.save_hyperparameters(ignore=groups_of(self.flat))
@@ -133,7 +133,7 @@ class Pretraining(pl.LightningModule, ABC, Generic[M]):
         self.image_encoder, self.feature_dropout = dict(image_encoder or {}), dict(feature_dropout or {})
         for name, share in self.feature_dropout.items():
             check_range(f"model.feature_dropout.{name}", share, 0, 1)
-        self.teaching = _Teaching(privileged or {}, told)
+        self.teaching = _Teaching(privileged or {}, unencoded)
         self.seed = seed
         self.guidance = guidance
         self.register_parameter("unused", None)
@@ -422,7 +422,7 @@ class Pretraining(pl.LightningModule, ABC, Generic[M]):
         if data != self._data_hash:
             changes = "".join(f", {name} {change}" for name, change in of_data.items())
             expected = f"the training data of the checkpoint (hash {short(str(data))})"
-            reason = "their scale and concepts would stay those of the checkpoint; start anew without --ckpt_path"
+            reason = "their scale and concepts would stay those of the checkpoint; start again without --ckpt_path"
             raise UserError(f"ckpt_path: expected {expected}, found others (hash {self._data_hash}{changes[:80]}): {reason}")
         if {"model.learning_rate", "model.weight_decay"} & of_model.keys():
             apply_rates(checkpoint, self.hparams["learning_rate"], self.hparams["weight_decay"])
@@ -445,9 +445,9 @@ class _Teaching:
         self.weights, self.share = dict(weights), share
         for name, weight in self.weights.items():
             check_range(f"model.privileged.{name}", weight, 0, LARGEST_FACTOR)
-        check_range("model.told", share, 0, 1)
+        check_range("model.unencoded", share, 0, 1)
         if share == 1 or (share and len(self.weights) != 1):
-            raise UserError(f"model.told: expected less than 1, and one name in model.privileged, found {share}")
+            raise UserError(f"model.unencoded: expected less than 1, and one name in model.privileged, found {share}")
 
     def check_taught(self, domain: Domain, images: ImageEncoders | None) -> None:
         """Refuse names that the domain does not provide or the encoder of ``images`` cannot predict."""
@@ -459,7 +459,7 @@ class _Teaching:
             place, expected = f"model.privileged.{name}", f"image_encoder of {privileged.feature.shape[0]} points"
             require(images.size == privileged.feature.size, place, expected, f"{images.size} outputs")
             possible = not self.share or privileged.simulate is not None
-            require(possible, "model.told", f"0, as the domain does not simulate encodings of {name!r}", self.share)
+            require(possible, "model.unencoded", f"0, as the domain does not simulate encodings of {name!r}", self.share)
 
     def attach(self, images: ImageEncoders | None) -> None:
         """Keep the outputs of image encoders."""
@@ -519,7 +519,5 @@ def check_different(concepts: Sequence[str], embeddings: Tensor) -> None:
     for number, text in enumerate(concepts):
         same = (embeddings[:number] == embeddings[number]).all(dim=1).nonzero()
         if len(same):
-            raise UserError(
-                f"concepts: {concepts[int(same[0])]!r} and {text!r} have the same embedding; expected texts that "
-                "data.encoder tells apart: change one"
-            )
+            first = concepts[int(same[0])]
+            raise UserError(f"concepts: {first!r} and {text!r} have the same embedding of data.encoder; change a text")

@@ -210,7 +210,7 @@ class Trainer(pl.Trainer):
                 raise
             reason = " ".join(f"{type(error).__name__}: {error}".split())[:150]
             raise UserError(
-                f"{self.ckpt_path}: expected a checkpoint of a run like this one, found one that cannot be restored ({reason})"
+                f"{self.ckpt_path}: expected a checkpoint of the same kind of run, found one that cannot be restored ({reason})"
             ) from error
 
     def invert(self, model: Adaptation, datamodule: pl.LightningDataModule) -> None:

@@ -135,7 +135,7 @@ def test_pictures_are_looked_at_in_part_of_the_windows_alone(
         return plain(self, observed)
 
     monkeypatch.setattr(ImageEncoders, "forward", counted)
-    module = PretrainingModule(privileged={PLACES: 1.0}, told=0.75, output=str(tmp_path / "model"), **SMALL)
+    module = PretrainingModule(privileged={PLACES: 1.0}, unencoded=0.75, output=str(tmp_path / "model"), **SMALL)
     trainer(max_steps=3, limit_val_batches=0).fit(module, datamodule=data)
     assert looked == [2, 2, 2]
     plan = {name: value.grad for name, value in module.raw.named_parameters() if value.grad is not None}
@@ -177,9 +177,9 @@ def test_invalid_options_are_refused(data: PretrainingData) -> None:
         ({"privileged": {PLACES: 1.0}, "denoiser_args": {}, **plain}, reads),
         (plain, "initial_encoder: expected flat, found points"),
         ({"privileged": {PLACES: -1.0}}, r"model.privileged.places: expected a number from 0"),
-        ({"told": 0.5}, "model.told: expected less than 1, and one name in model.privileged, found 0.5"),
-        ({"told": 1.0, "privileged": {PLACES: 1.0}}, "model.told: expected less than 1"),
-        ({"told": 1.5, "privileged": {PLACES: 1.0}}, "model.told: expected a number from 0 to 1"),
+        ({"unencoded": 0.5}, "model.unencoded: expected less than 1, and one name in model.privileged, found 0.5"),
+        ({"unencoded": 1.0, "privileged": {PLACES: 1.0}}, "model.unencoded: expected less than 1"),
+        ({"unencoded": 1.5, "privileged": {PLACES: 1.0}}, "model.unencoded: expected a number from 0 to 1"),
         ({"draws": 0}, "model.draws: expected a number from 1|model.draws: expected 1"),
     ):
         with pytest.raises(UserError, match=message):

@@ -258,7 +258,9 @@ def test_without_a_last_checkpoint_none_is_evaluated_and_fit_says_that_it_starts
     for verb in ("test", "validate"):
         refused(capsys, [verb, *FIT[1:], "--ckpt_path=last"], f"ckpt_path: {verb} expected a checkpoint file, found none")
     succeed(*FIT, "--trainer.max_steps=1", "--trainer.limit_val_batches=0", "--ckpt_path=last")
-    assert "ckpt_path: no last checkpoint in logs/object_rearrangement/fit; fit starts anew\n" in capsys.readouterr().out
+    assert (
+        "ckpt_path: no last checkpoint in logs/object_rearrangement/fit; fit starts from the beginning\n" in capsys.readouterr().out
+    )
 
 
 # Numbers that are not finite

@@ -82,7 +82,7 @@ def stopped(arguments: list[str], capsys: Told, *expected: str) -> None:
 def test_a_run_does_not_go_on_with_other_data(fit: list[str], capsys: Told) -> None:
     states, texts = strokes()
     others = "ckpt_path: expected the training data of the checkpoint (hash "
-    stopped([*fit, *FURTHER, changed(states=3 * states)], capsys, others, "start anew without --ckpt_path")
+    stopped([*fit, *FURTHER, changed(states=3 * states)], capsys, others, "start again without --ckpt_path")
     stopped([*fit, *FURTHER, changed(states=states[::-1])], capsys, others)
     stopped([*fit, *FURTHER, "--data.validation_share=0.6"], capsys, others, "data.validation_share 0.6 (before: 0.1)")
     stopped([*fit, *FURTHER, changed(concepts=np.char.add(texts, " 2"))], capsys, "ckpt_path: key 'training_concepts': expected")

@@ -195,7 +195,7 @@ def outcomes(plan: Sequence[Sequence[Cell]], results: str) -> list[list[tuple[Ce
     known, record, fits = known_hashes(results), read_record(results), _fits(plan)
     found: list[list[tuple[Cell, Outcome | None]]] = []
     read: dict[str, bool] = {}  # by folder of a model: whether a cell that must run reads it
-    with bar("cells looked at", sum(map(len, plan)), lines=False) as advance:
+    with bar("cells compared", sum(map(len, plan)), lines=False) as advance:
         for cells in reversed(plan):
             found.insert(0, [])
             for cell in cells:

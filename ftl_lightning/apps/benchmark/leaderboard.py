@@ -22,9 +22,9 @@ BEGIN, END = "<!-- leaderboard: begin -->\n", "<!-- leaderboard: end -->\n"
 MARK = "≈"  # mark of methods whose numbers cannot be recomputed to the digit
 HEAD = """# Leaderboard
 
-This page is made by `ftl-lightning benchmark --leaderboard docs/leaderboard.md` from the files in `results/submissions`,
-each of which passes `benchmark --check`. References, in italics, were computed by this package; no submission changes them.
-[The protocol](benchmark.md) says what the numbers mean and how to add a line.
+How good are the submitted methods? `ftl-lightning benchmark --leaderboard docs/leaderboard.md` makes this page from the checked
+files in `results/submissions`. Reference policies are in italics. [Benchmark](benchmark.md) explains the numbers and how to add
+a method.
 """
 
 
@@ -116,8 +116,8 @@ def leaderboard(submissions: Sequence[Submission]) -> str:
 
 
 def inexact(submission: Submission, references: References) -> str:
-    """Why numbers of a submission cannot be recomputed to the digit, in Markdown; empty if they can. The machine of the reference
-    lines is the one that recomputes.
+    """Why numbers of a submission cannot be recomputed to the digit, in Markdown; empty if they can. The machine that computed the
+    references recomputes.
     """
     reasons = []
     ours = {"ftl-lightning": references.version, **references.machine}
@@ -145,7 +145,7 @@ def _section(suite: BenchmarkSuite, submissions: Sequence[Submission], reference
     head = ["method", *measures, "model", "pretraining, s", "learning and evaluation, s"]
     lines = [*_lines(suite, runs, marks), *_reference_lines(suite, references)]
     lines.sort(key=lambda line: -line[0])
-    table = [_row(head), _row(["---"] * len(head)), *(_row(cells) for _, cells in lines)]
+    table = [_row(head), f"|{'---|' * len(head)}", *(_row(cells) for _, cells in lines)]
     return f"## {markdown(suite.title)}\n\n" + "\n".join(table) + "\n"
 
 
@@ -169,10 +169,10 @@ def _origins(group: Sequence[Run]) -> str:
 
 
 def _reference_lines(suite: BenchmarkSuite, references: References) -> Iterator[tuple[float, list[str]]]:
-    """Score and cells of each reference policy."""
+    """Score and cells of each reference policy; without model and times, which a reader of Markdown leaves empty."""
     for name, scores in references.scores.get(suite.name, {}).items():
         cells = [_shown(scores[measure]) if measure in scores else "-" for measure in suite.measures]
-        yield scores[suite.headline].mean, [f"*{markdown(name)}*", *cells, "-", "-", "-"]
+        yield scores[suite.headline].mean, [f"*{markdown(name)}*", *cells]
 
 
 def _shown(value: Score) -> str:

@@ -63,7 +63,7 @@ class Limits:
 
     Attributes:
         connections, per_address: maximum number of connections, and of those from one address. A new connection takes the place of
-            the one that has waited longest for a request, and is refused if all are busy.
+            the connection that has waited longest for a request, and is refused if all are busy.
         headers, body: maximum seconds to receive the headers of a request, and its body.
         idle: seconds before a connection without a new request is closed.
     """
@@ -138,7 +138,7 @@ class Connection(H11Protocol):
 
 
 def _has_room(group: Sequence[Connection], most: int) -> bool:
-    """Whether there is room for one more connection; if there are too many, abort the one that has waited longest."""
+    """Whether there is room for one more connection; if there are too many, abort the connection that has waited longest."""
     if len(group) < most:
         return True
     if not (waiting := [other for other in group if not other.busy]):

@@ -136,7 +136,7 @@ def _check_space(space: Any, key: str) -> int:
 
 @dataclass(frozen=True)
 class _Raw:
-    """Episode as it is stored: a reader of a part of its observations by key, its actions, its infos and its metadata."""
+    """Stored episode: a reader of a part of its observations by key, its actions, its infos and its metadata."""
 
     part: Callable[[str], Any]
     actions: Any

@@ -91,12 +91,12 @@ SUITES = {
     "training": training_suite(TRAINING_CONCEPTS),
     "paper": Suite((EvaluationTask(NEW, "roundabout", learned=("roundabout",)),)),
     "validation": Suite((EvaluationTask(NEW, "roundabout third exit", learned=("roundabout third exit",)),)),
-    "rules": Suite(tuple(EvaluationTask("new scenario", name, learned=(name,)) for name in RULES)),
+    "more": Suite(tuple(EvaluationTask("new scenario", name, learned=(name,)) for name in RULES)),
     "other roundabouts": Suite(
         tuple(EvaluationTask("other roundabout", name, learned=("roundabout",)) for name in OTHER_ROUNDABOUTS)
     ),
 }
-"""``validation`` is another route through the same roundabout; ``rules`` and ``other roundabouts`` are not used for tuning."""
+"""``validation`` is another route through the same roundabout; ``more`` and ``other roundabouts`` are not used for tuning."""
 
 
 SHIPPED = Path(__file__).parent / "demonstrations"  # a file of expert episodes per training scenario; see its data card

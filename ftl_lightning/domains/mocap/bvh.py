@@ -236,7 +236,7 @@ def bvh(states: Tensor) -> str:
     Blender. Bones have the lengths of the first frame and the rest directions of a standing pose. Rotations between frames are
     minimal, so that no arm spins about its axis.
     """
-    require(states.isfinite().all(), "export", "motion of finite numbers", "others; draw it anew with another --seed")
+    require(states.isfinite().all(), "export", "motion of finite numbers", "others; draw it again with another --seed")
     places = _places(states)
     (rest,) = _places(standing_poses(1, torch.Generator().manual_seed(0)))
     turns: list[Numbers] = []  # of each joint in the file's axes, (frame, 3, 3)

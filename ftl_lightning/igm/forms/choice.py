@@ -50,16 +50,16 @@ TOLERANCE = 0.01
 """Default tolerance of early stopping."""
 OWN, BOTH, ALL = 0.8, 2.03, 3.27
 """One set suffices if its relative training loss is at most the first value; or if the sum of training and leave-one-out losses is
-at most the second, or with sets in the span, the sum including the span's leave-one-out loss at most the third. Chosen on relations
-not seen in pretraining, see docs/findings.md#own-data.
+at most the second, or with sets in the span of the training embeddings, the sum including their leave-one-out loss at most the
+third. Chosen on relations not seen in pretraining, see docs/findings.md#own-data.
 """
 NARROW, WIDE = 0.65, 0.75
 """Spread of samples, relative to demonstrations: below the first value mixtures replace one set; mixtures above the second are
 stretched less."""
 Concepts = Mapping[str, Concept]
 SPAN_LOSS = 1.03
-"""Maximum ratio of leave-one-out losses, in the span of the training concepts to free, to compose a concept from a set in the
-span."""
+"""Maximum ratio of leave-one-out losses, in the span of the training embeddings to free, to compose a concept from a set in
+this span."""
 
 
 def learn(
@@ -303,7 +303,7 @@ class _Shares:
 
     @property
     def composes(self) -> bool:
-        """Whether a set in the span has about the leave-one-out loss of a free set."""
+        """Whether a set in the span of the training embeddings has about the leave-one-out loss of a free set."""
         return self.left_out is not None and self.in_span is not None and self.in_span <= SPAN_LOSS * self.left_out
 
     @property

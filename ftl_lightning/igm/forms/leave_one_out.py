@@ -238,7 +238,7 @@ def quickly(settings: InversionSettings) -> InversionSettings:
 
 
 def find_outlier(losses: Tensor) -> int | None:
-    """Index of the demonstration with a left-out loss ``(demo,)`` far above the others'; ``None`` without any."""
+    """Index of the demonstration with a left-out loss ``(demo,)`` far above the other losses; ``None`` without any."""
     if len(losses) < 3:
         return None
     worst = int(losses.argmax())
