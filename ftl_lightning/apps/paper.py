@@ -99,8 +99,14 @@ def printed(item: Item, results: Path) -> str:
 
 
 def cells_of(chosen: Sequence[Item], results: Path, root: str = "") -> dict[str, list[Cell]]:
-    """Cells behind the numbers of items (of included tables by the columns of ``behind``), by name of the results file: those of ``conf/ablation/NAME.yaml`` with the hashes of the
-    rows, after the pretrainings of their models. ``root`` is the folder of recordings, for domains that read one.
+    """Cells behind the numbers of items, by name of the results file.
+
+    They are the cells of ``conf/ablation/NAME.yaml`` with the hashes of the rows, after the pretrainings of their models. Rows of
+    included tables are those with the columns of ``behind``.
+
+    Args:
+        chosen, results: items, and the folder of results whose records name the cells.
+        root: folder of recordings, for domains that read one.
     """
     wanted: dict[str, set[str]] = {}
     for item in chosen:

@@ -39,7 +39,7 @@ LANGUAGE = BASELINES[-1]
 METHODS = (PAPERS_METHOD, Compared(OURS, CHOSEN), Compared(OURS, WITH_MODES), *map(Compared, BASELINES), Compared(FINE_TUNED))
 """Order of methods in tables; our other forms follow ours, other methods come last."""
 ALIKE = 0.9  # minimum share of episodes with our outcome for which a reference policy is annotated
-LINES = 7  # maximum number of lines of the short overview
+LINES, EACH = 8, 2  # maximum number of lines of the short overview, and of each domain
 ORACLE = "(oracle)"  # in the names of references that know the right behaviour
 MEASURED = ("measured", "spread over seeds")  # columns of a number in the comparison
 
@@ -144,8 +144,8 @@ def shown_lines(results: pd.DataFrame) -> list[tuple[Domain, str, str]]:
 
 
 def short_lines(results: pd.DataFrame) -> list[tuple[Domain, str, str]]:
-    """At most :data:`LINES` lines of :func:`shown_lines`: of each domain in turn the settings of new concepts in the metric of the
-    headline, those with most tasks first.
+    """At most :data:`LINES` lines of :func:`shown_lines`: of each domain in turn :data:`EACH` settings of learned concepts with the
+    most tasks, in the metric of the headline.
     """
     lines: dict[str, list[tuple[Domain, str, str]]] = {}
     for domain in _domains(results):
@@ -154,7 +154,7 @@ def short_lines(results: pd.DataFrame) -> list[tuple[Domain, str, str]]:
         learned = {task.setting for suite in domain.concepts.suites.values() for task in suite.tasks if task.learned}
         found = [name for name in found if name in learned and _comparable(domain, rows, name, metric)]
         found.sort(key=lambda setting: -select(rows, setting=setting)["task"].nunique())
-        lines[domain.name] = [(domain, setting, metric) for setting in found]
+        lines[domain.name] = [(domain, setting, metric) for setting in found[:EACH]]
     shown = [line for turn in zip_longest(*lines.values()) for line in turn if line][:LINES]
     return sorted(shown, key=lambda line: list(lines).index(line[0].name))
 

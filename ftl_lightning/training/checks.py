@@ -30,6 +30,8 @@ share of explained demonstrations for a known task.
 """
 MOST_FAULTS = 6
 """Maximum number of reported findings, most severe first."""
+COVERED_BY_A_PLAN = 0.8
+"""Minimum share of the longest demonstration in a plan, for windows of demonstrations to need no note."""
 EXCESS = 0.05
 """Tolerated excess, as a share of half a column's pretraining range."""
 MANY, OUTSIDE = 0.25, 3.0
@@ -226,7 +228,8 @@ def combination_line(model: ConceptModel, demonstrations: Demonstrations, settin
 def longer_than_plans(demonstrations: Demonstrations, model: ConceptModel) -> str:
     """Note about the use of demonstrations that are longer than the model's plans; empty without any.
 
-    A plan may start at any time in closed-loop domains with observations at every time, which need no note.
+    None is needed for closed-loop domains with observations at every time, where a plan may start at any time, and where a plan
+    covers at least :data:`COVERED_BY_A_PLAN` of the longest demonstration.
     """
     window, plans = model.window, model.domain.plans
     longest, shortest = int(demonstrations.lengths.max()), int(demonstrations.lengths.min())
@@ -239,7 +242,8 @@ def longer_than_plans(demonstrations: Demonstrations, model: ConceptModel) -> st
             f"{start} cut to the model's horizon of {window}: the first {window} steps are learned from, "
             f"as {names} is known at the first time alone"
         )
-    if demonstrations.observed and model.domain.closed_loop is not None and plans.exponent(window) == 1:
+    executed = bool(demonstrations.observed) and model.domain.closed_loop is not None and plans.exponent(window) == 1
+    if executed or window >= COVERED_BY_A_PLAN * longest:
         return ""
     # The same exponent decides where windows start, see Demonstrations.starts.
     where = "anywhere" if plans.exponent(window) == 1 else "anywhere, mostly early"

@@ -18,7 +18,7 @@ def test_items_are_named_by_words_and_numbers() -> None:
     assert [item["item"] for item in items("table 1")] == ["Table 1"]
     assert [item["item"] for item in items("7")] == ["Figures 6 (right), 7 and 13"]
     assert len(items()) > 10
-    with pytest.raises(UserError, match="paper: expected one of Figures 1 and 2.*; or all, found Table 99"):
+    with pytest.raises(UserError, match=r"paper: expected one of Figures 1 and 2.*; or all, found Table 99"):
         items("Table 99")
 
 
