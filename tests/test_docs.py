@@ -56,8 +56,8 @@ def commands(text: str) -> list[tuple[str, list[str]]]:
     return [(verb, CONFIG.findall(options)) for verb, options in COMMAND.findall(text)]
 
 
-def test_the_readme_has_at_most_1500_words() -> None:
-    assert len(README.read_text(encoding="utf-8").split()) <= 1500
+def test_the_readme_has_at_most_900_words() -> None:
+    assert len(README.read_text(encoding="utf-8").split()) <= 900
 
 
 CLAIMS = runpy.run_path(str(ROOT / "docs" / "claims.py"))

@@ -185,11 +185,12 @@ def short_overview(results: pd.DataFrame) -> Table:
             if (cell := _cell(domain, rows, method, setting, metric)) != MISSING
         ]
         rivals = [
-            (sign * number.mean, f"{label(*method)} {_cell(domain, rows, method, setting, metric)}")
+            (sign * number.mean, method)
             for method in methods(rows)
             if method.name != OURS
             if (number := summarise(select(of_method(rows, method), setting=setting, metric=metric)))
         ]
+        rival = max(rivals, key=itemgetter(0))[1] if rivals else None
         means = select(references, setting=setting, metric=metric).groupby("method")["value"].mean()
         best = [
             max(named, key=lambda found: sign * found[1])
@@ -201,14 +202,14 @@ def short_overview(results: pd.DataFrame) -> Table:
             [
                 _subject(domain, setting, metric),
                 ", ".join(f"{form} {cell}".strip() for form, cell in ours) or MISSING,
-                max(rivals, key=itemgetter(0))[1] if rivals else MISSING,
+                MISSING if rival is None else f"{label(*rival)} {_cell(domain, rows, rival, setting, metric)}",
                 ", ".join(f"{name} {mean:.2f}" for name, mean in best) or MISSING,
-                MISSING if lead is None else str(lead),
+                MISSING if lead is None else f"{lead.amount}, {lead.shown}" if lead.baseline == rival else str(lead),
             ]
         )
     caption = (
         f"New concepts, mean ± standard error over tasks{_brackets(results)}. FTL-IGM: first the paper's form of the concept; "
-        "networks, views and losses are ours. Lead: by how much ours is better, with its 95 % interval over tasks"
+        "networks, views and losses are ours. Lead: over the best or the named baseline, with its 95 % interval over tasks"
     )
     head = ["domain: setting, metric", OURS, "best baseline", "best without learning, oracle", "lead"]
     return make_table(None, "overview", caption, lines, head)
