@@ -378,6 +378,7 @@ def test_to_enter_a_column_of_vehicles_without_a_gap_is_an_offence_and_an_overta
     assert arrived(env, "overtake")  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RULES)
 def test_constant_decisions_fail_in_half_of_the_scenes_or_more(name: str) -> None:
     for decision in ("FASTER", "IDLE", "SLOWER"):

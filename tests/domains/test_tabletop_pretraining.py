@@ -140,7 +140,7 @@ def test_pictures_are_looked_at_in_part_of_the_windows_alone(
     assert looked == [2, 2, 2]
     plan = {name: value.grad for name, value in module.raw.named_parameters() if value.grad is not None}
     assert any(name.startswith("denoiser") for name in plan)
-    assert load_model(tmp_path / "model").config.training["model"]["told"] == 0.75
+    assert load_model(tmp_path / "model").config.training["model"]["unencoded"] == 0.75
 
 
 def test_places_move_with_the_picture_and_what_has_none_is_also_seen_higher(data: PretrainingData) -> None:
