@@ -121,9 +121,8 @@ def cells_of(chosen: Sequence[Item], results: Path, root: str = "") -> dict[str,
         cells = [cell for stage in planned(stages, content["seeds"], root).values() for cell in stage] if stages else []
         needed = [cell for cell in cells if cell.name in record and record[cell.name].config_hash in hashes]
         require(needed, f"paper: {file}", f"a plan {plan} with the cells of these rows", f"none; see {results / 'README.md'}")
-        models = {cell.options.get("model.pretrained") for cell in needed}
-        fits = [cell for cell in cells if cell.verb == "fit" and cell.options.get("model.output") in models]
-        found[file] = [*fits, *needed]
+        fits = {cell.pretraining.name: cell.pretraining for cell in needed if cell.pretraining}
+        found[file] = [*fits.values(), *needed]
     return found
 
 

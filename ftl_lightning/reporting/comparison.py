@@ -198,14 +198,14 @@ def short_overview(results: pd.DataFrame) -> Table:
             if (named := [(name, mean) for name, mean in means.items() if (ORACLE in str(name) or name == FRESH) == kind])
         ]
         lead = least_certain(_leads(domain, rows, setting, metric))
-        named = f"{domain.comparison.ours.form}: " if domain.comparison.ours.form else ""
+        prefix = f"{domain.comparison.ours.form}: " if domain.comparison.ours.form else ""
         lines.append(
             [
                 _subject(domain, setting, metric),
                 ", ".join(f"{form} {cell}".strip() for form, cell in ours) or MISSING,
                 MISSING if rival is None else f"{label(*rival)} {_cell(domain, rows, rival, setting, metric)}",
                 ", ".join(f"{name} {mean:.2f}" for name, mean in best) or MISSING,
-                MISSING if lead is None else named + (f"{lead.amount}, {lead.shown}" if lead.baseline == rival else str(lead)),
+                MISSING if lead is None else prefix + (f"{lead.amount}, {lead.shown}" if lead.baseline == rival else str(lead)),
             ]
         )
     brackets = _brackets(results) if any("[" in line[1] + line[2] for line in lines) else ""

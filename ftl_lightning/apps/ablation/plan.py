@@ -68,7 +68,9 @@ class Resources:
 
 @dataclass(frozen=True)
 class Cell:
-    """Run of a verb with configuration files, options, ``done`` file, name and resources."""
+    """Run of a verb with configuration files, options, ``done`` file, name, resources, and the pretraining of its model if the plan
+    has it.
+    """
 
     verb: Literal["fit", "invert"]
     configs: tuple[str, ...]
@@ -76,6 +78,7 @@ class Cell:
     done: str
     name: str
     resources: Resources = field(default_factory=Resources)
+    pretraining: "Cell | None" = None
 
     @property
     def arguments(self) -> list[str]:

@@ -116,7 +116,7 @@ def run_ablation(
 
     all_cells = [cell for cells in plan for cell in cells]
     check(all_cells)
-    known_outcomes, fits = outcomes(plan, results), _fits(plan)
+    known_outcomes = outcomes(plan, results)
     total, number, failed = len(all_cells), 0, []
     start = time.monotonic()
     noted = partial(tell, results)
@@ -147,7 +147,7 @@ def run_ablation(
                     failed.append(f"{cell}: {outcome.error}")
                 states[cell.name] = "failed" if outcome.error else "done"
                 if outcome.config_hash:
-                    outcome = replace(outcome, settings=settings_of(cell, fits))
+                    outcome = replace(outcome, settings=settings_of(cell))
                 noted([cell], states[cell.name], outcome)
                 advance(1, count_states(list(states.values())))
     if failed or executor == "ray":
@@ -174,12 +174,17 @@ def planned(stages: Sequence[Stage], seeds: Sequence[int], root: str = "", only:
     for number in only:
         require(1 <= number <= len(stages), "only", f"numbers of stages from 1 to {len(stages)}", number)
     shared = {"data.root": root} if root else {}
-    chosen = {
-        number: replace(stage, options={**shared, **stage.options})
-        for number, stage in enumerate(stages, 1)
+    rooted = [replace(stage, options={**shared, **stage.options}) for stage in stages]
+    every = {number: [cell for seed in seeds for cell in stage.cells(seed)] for number, stage in enumerate(rooted, 1)}
+    fits = {cell.options.get("model.output", ""): cell for cells in every.values() for cell in cells if cell.verb == "fit"}
+    return {
+        number: [
+            cell if cell.verb == "fit" else replace(cell, pretraining=fits.get(cell.options.get("model.pretrained", "")))
+            for cell in cells
+        ]
+        for number, cells in every.items()
         if not only or number in only
     }
-    return {number: [cell for seed in seeds for cell in stage.cells(seed)] for number, stage in chosen.items()}
 
 
 def show_estimate(plan: Sequence[Sequence[Cell]], results: str, workers: int = 0) -> None:
@@ -192,7 +197,7 @@ def outcomes(plan: Sequence[Sequence[Cell]], results: str) -> list[list[tuple[Ce
     """The cells of each stage with the outcome of an earlier run; ``None`` if a cell must run. A pretraining whose model is missing
     must run if a cell of the plan that must run reads the model, or if no cell of the plan reads it.
     """
-    known, record, fits = known_hashes(results), read_record(results), _fits(plan)
+    known, record = known_hashes(results), read_record(results)
     found: list[list[tuple[Cell, Outcome | None]]] = []
     read: dict[str, bool] = {}  # by folder of a model: whether a cell that must run reads it
     with bar("cells compared", sum(map(len, plan)), lines=False) as advance:
@@ -203,7 +208,7 @@ def outcomes(plan: Sequence[Sequence[Cell]], results: str) -> list[list[tuple[Ce
                     again = not _is_made(cell) and read.get(cell.options.get("model.output", ""), True)
                     outcome = None if again else Outcome(note="done before")
                 else:
-                    outcome = _before(cell, known, record, fits)
+                    outcome = _before(cell, known, record)
                     model = cell.options.get("model.pretrained", "")
                     read[model] = outcome is None or read.get(model, False)
                 found[0].append((cell, outcome))
@@ -221,7 +226,7 @@ def _is_made(cell: Cell) -> bool:
     return bool(cell.done) and Path(cell.done).is_file()
 
 
-def _before(cell: Cell, known: set[str], record: Mapping[str, CellRecord], fits: Mapping[str, Cell]) -> Outcome | None:
+def _before(cell: Cell, known: set[str], record: Mapping[str, CellRecord]) -> Outcome | None:
     """Outcome of an inversion whose rows are in the results. The hash of its configuration contains that of the pretrained model;
     where the model is missing, the record of a run with the same settings decides.
     """
@@ -230,7 +235,7 @@ def _before(cell: Cell, known: set[str], record: Mapping[str, CellRecord], fits:
     if not known:
         return None
     entry = record.get(cell.name, CellRecord())
-    if entry.config_hash in known and entry.settings == settings_of(cell, fits):
+    if entry.config_hash in known and entry.settings == settings_of(cell):
         return Outcome(note=IN_RESULTS)
     from ftl_lightning.apps.lightning_cli import build
 
@@ -240,19 +245,11 @@ def _before(cell: Cell, known: set[str], record: Mapping[str, CellRecord], fits:
     return None
 
 
-def _fits(plan: Sequence[Sequence[Cell]]) -> dict[str, Cell]:
-    """The pretrainings of a plan by the folder of their model."""
-    return {cell.options.get("model.output", ""): cell for cells in plan for cell in cells if cell.verb == "fit"}
-
-
-def settings_of(cell: Cell, fits: Mapping[str, Cell]) -> str:
-    """Hash of the values of all options of a cell but the folder of recordings, and of the pretraining of its model if that is part
-    of the plan.
-    """
+def settings_of(cell: Cell) -> str:
+    """Hash of the values of all options of a cell, but the folder of recordings, and of its pretraining."""
     from ftl_lightning.apps.lightning_cli import parse
 
-    fit = fits.get(cell.options.get("model.pretrained", "")) if cell.verb == "invert" else None
-    values = [parse(one.verb, one.arguments) for one in (cell, fit) if one]
+    values = [parse(one.verb, one.arguments) for one in (cell, cell.pretraining) if one]
     for options in values:
         options["data"]["init_args"].pop("root", None)
     return content_hash(values)

@@ -53,4 +53,4 @@ def nothing_is_run(monkeypatch: pytest.MonkeyPatch) -> None:
     """Cells of this process are only counted: files that they name need not be there."""
     monkeypatch.setattr(run, "attempt", at_once)
     monkeypatch.setattr(run, "check", lambda cells: None)
-    monkeypatch.setattr(run, "_before", lambda cell, known, record, fits: Outcome() if cell.name in known else None)
+    monkeypatch.setattr(run, "_before", lambda cell, known, record: Outcome() if cell.name in known else None)

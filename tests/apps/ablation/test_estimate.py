@@ -101,7 +101,7 @@ def test_what_was_measured_is_known_without_the_models(monkeypatch: pytest.Monke
     fit = next(Stage("fit", "a.yaml", options={"model.output": "logs/m"}, done="logs/m/config.json").cells(0))
     reads, other = (next(Stage("invert", "a.yaml", name=name, options={"model.pretrained": "logs/m"}).cells(0)) for name in "ab")
     plan = [[fit], [reads, other]]
-    monkeypatch.setattr(run, "settings_of", lambda cell, fits: f"settings of {cell.name}")
+    monkeypatch.setattr(run, "settings_of", lambda cell: f"settings of {cell.name}")
     monkeypatch.setattr(run, "known_hashes", lambda results: {"2:a", "2:b"})
 
     def measured(cell: Cell, config_hash: str) -> None:
@@ -114,5 +114,5 @@ def test_what_was_measured_is_known_without_the_models(monkeypatch: pytest.Monke
     measured(other, "2:b")
     assert run.to_run(run.outcomes(plan, "r.csv")) == [[], []]
     assert run.to_run(run.outcomes([[fit]], "r.csv")) == [[fit]]
-    monkeypatch.setattr(run, "settings_of", lambda cell, fits: "changed")
+    monkeypatch.setattr(run, "settings_of", lambda cell: "changed")
     assert run.to_run(run.outcomes(plan, "r.csv")) == plan
