@@ -34,9 +34,9 @@ def items(name: str = "") -> list[Item]:
         UserError: if no name does.
     """
     every: list[Item] = yaml.safe_load(ITEMS.read_text("utf-8"))
-    found = [item for item in every if _words(name) <= _words(item["item"])]
-    require(found, "paper", f"one of {'; '.join(item['item'] for item in every)}; or all", name)
-    return found
+    named = [item for item in every if _words(name) <= _words(item["item"])]
+    require(named, "paper", f"one of {'; '.join(item['item'] for item in every)}; or all", name)
+    return named
 
 
 def _words(text: str) -> set[str]:
@@ -49,18 +49,18 @@ def alike(rows: pd.DataFrame, chosen: Mapping[str, Any], where: str) -> pd.DataF
     Raises:
         UserError: if there are none, or rows of several settings.
     """
-    found = latest(select(rows, **chosen))
-    require(not found.empty, where, f"rows with {dict(chosen)}", "none")
+    selected = latest(select(rows, **chosen))
+    require(not selected.empty, where, f"rows with {dict(chosen)}", "none")
     for column in ONE_OF:
-        different = sorted(set(map(str, found[column])))
+        different = sorted(set(map(str, selected[column])))
         require(len(different) == 1, where, f"rows of one {column}", str(different))
-    return found
+    return selected
 
 
 def measured(rows: pd.DataFrame, chosen: Mapping[str, Any], where: str) -> Number:
     """The number behind the rows of :func:`alike`."""
     number = summarise(alike(rows, chosen, where))
-    assert number is not None  # some rows were found
+    assert number is not None  # there are rows
     return number
 
 
@@ -108,13 +108,15 @@ def cells_of(chosen: Sequence[Item], results: Path, root: str = "") -> dict[str,
         chosen, results: items, and the folder of results whose records name the cells.
         root: folder of recordings, for domains that read one.
     """
-    wanted: dict[str, set[str]] = {}
+    selections: dict[str, list[dict[str, Any]]] = {}
     for item in chosen:
-        behind = [dict(values) for values in item.get("behind", ())]
-        for file, values in [*((file, values) for _, _, file, values in lines_of(item)), *((v.pop("file"), v) for v in behind)]:
-            wanted.setdefault(file, set()).update(latest(select(read_rows(results / file), **values))["config_hash"])
-    found = {}
-    for file, hashes in wanted.items():
+        for values in [*({"file": file, **values} for _, _, file, values in lines_of(item)), *item.get("behind", ())]:
+            columns = dict(values)
+            selections.setdefault(columns.pop("file"), []).append(columns)
+    cells_by_file = {}
+    for file, selected in selections.items():
+        rows = read_rows(results / file)
+        hashes = {config_hash for columns in selected for config_hash in latest(select(rows, **columns))["config_hash"]}
         record, plan = read_record(results / file), Path("conf/ablation", file).with_suffix(".yaml")
         content = yaml.safe_load(plan.read_text("utf-8")) if plan.is_file() else {}
         stages = [Stage(**stage) for stage in content.get("stages", ())]
@@ -122,8 +124,8 @@ def cells_of(chosen: Sequence[Item], results: Path, root: str = "") -> dict[str,
         needed = [cell for cell in cells if cell.name in record and record[cell.name].config_hash in hashes]
         require(needed, f"paper: {file}", f"a plan {plan} with the cells of these rows", f"none; see {results / 'README.md'}")
         fits = {cell.pretraining.name: cell.pretraining for cell in needed if cell.pretraining}
-        found[file] = [*fits.values(), *needed]
-    return found
+        cells_by_file[file] = [*fits.values(), *needed]
+    return cells_by_file
 
 
 def measure_again(chosen: Sequence[Item], results: Path, out: Path, root: str = "") -> None:
