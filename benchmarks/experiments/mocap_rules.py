@@ -1,51 +1,91 @@
-"""Rates at which the rules of human motion hold in recordings of the action and of training concepts.
+"""Set the thresholds of the rules of human motion from recordings, and measure how often the rules hold in recordings.
 
-python benchmarks/experiments/mocap_rules.py --root FOLDER --out results/mocap_rules.json
+    python benchmarks/experiments/mocap_rules.py --root FOLDER --out results/mocap_rules.json
+
+Each threshold accepts 95 % of the windows of every person who shows the action. A window starts within four frames of a moment
+nearest to standing, as demonstrations do. ``--check true`` measures with the shipped thresholds and does not set them.
 """
 
 import argparse
 import json
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import torch
 from mocap_distances import stretches, windows
 from torch import Tensor
 
-from ftl_lightning.domains.mocap.measures import RULES
-from ftl_lightning.domains.mocap.source import Recorded
+from ftl_lightning.domains.mocap import measures
+from ftl_lightning.domains.mocap.measures import CONDITIONS, arm_rotation
+from ftl_lightning.domains.mocap.skeleton import HORIZON
+from ftl_lightning.domains.mocap.source import Recorded, at_rest
 from ftl_lightning.services.tensor_file import write_text
 
-STRIDE = 8
-"""Frames between windows of the training concepts' trials."""
+QUANTILE = 0.05  # Share of each person's windows that a threshold refuses
+AROUND = 4  # Maximum frames between the start of a window and a moment nearest to standing
+STRIDE = 8  # Frames between windows of the training concepts' trials
+FILE = Path(measures.__file__).parent / "rules.json"
+Thresholds = Mapping[str, float]
 
 
-def shown(source: Recorded, action: str) -> dict[str, Tensor]:
-    """All windows ``(window, 32, 42)`` of an action by person."""
+def shown(source: Recorded, action: str, around: int | None = AROUND) -> dict[str, Tensor]:
+    """Windows ``(window, 32, 42)`` of an action by person; ``None`` for windows that start at any frame."""
     found = dict[str, list[Tensor]]()
     for subject, states in stretches(source, action):
-        found.setdefault(subject, []).extend(windows(states, 1))
+        rest = at_rest(states)
+        starts = range(len(states) - HORIZON + 1)
+        chosen = [start for start in starts if around is None or any(abs(start - frame) <= around for frame in rest)]
+        found.setdefault(subject, []).extend(states[start : start + HORIZON] for start in chosen)
     return {subject: torch.stack(own) for subject, own in found.items()}
+
+
+def thresholds(action: str, people: Sequence[Tensor]) -> dict[str, float]:
+    """Threshold of each condition: the loosest of the people's quantiles, rounded to the looser side."""
+    limits = {}
+    for name, (measure, least) in CONDITIONS[action].items():
+        values = [float(measure(states).quantile(QUANTILE if least else 1 - QUANTILE)) for states in people]
+        limits[name] = math.floor(min(values) * 1000) / 1000 if least else math.ceil(max(values) * 1000) / 1000
+    return limits
+
+
+def rate(action: str, limits: Thresholds, states: Tensor) -> float:
+    """Share of windows that satisfy an action's rule with these thresholds."""
+    kept = measures.jerk("", states, None) < measures.TREMBLING
+    for name, (measure, least) in CONDITIONS[action].items():
+        kept &= measure(states) >= limits[name] if least else measure(states) <= limits[name]
+    return round(float(kept.float().mean()), 4)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """See the module."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--root", type=Path, required=True, help="recordings, as `prepare mocap` leaves them")
+    parser.add_argument("--root", type=Path, required=True, help="folder of prepared recordings")
     parser.add_argument("--out", type=Path, default=Path("results/mocap_rules.json"))
+    parser.add_argument("--check", type=bool, default=False)
     chosen = parser.parse_args(arguments)
     source = Recorded(chosen.root)
     training = source.split("train", 0, 0)
     half = range(len(training) // 2)  # the others are mirror images
     others = torch.stack([one for row in half for one in windows(training.states[row, : int(training.lengths[row])], STRIDE)])
-    found = {}
-    for action, rule in RULES.items():
+    limits, found = {}, {}
+    for action in CONDITIONS:
         own = shown(source, action)
-        held = {subject: round(float(rule(states).float().mean()), 4) for subject, states in own.items()}
-        number = {subject: len(states) for subject, states in own.items()}
-        demonstrations = float(rule(source.draw(action, 5, 0).states).float().mean())
-        wrong = round(float(rule(others).float().mean()), 5)
-        found[action] = {"windows": number, "holds": held, "demonstrations": demonstrations, "training concepts": wrong}
+        limits[action] = measures.THRESHOLDS[action] if chosen.check else thresholds(action, [*own.values()])
+        anywhere = shown(source, action, None)
+        rest = {one: [states for other, states in own.items() if other != one] for one in own}
+        found[action] = {
+            "windows": {one: len(states) for one, states in own.items()},
+            "holds": {one: rate(action, limits[action], states) for one, states in own.items()},
+            "holds at any phase": {one: rate(action, limits[action], states) for one, states in anywhere.items()},
+            "holds, set by the others": {one: rate(action, thresholds(action, rest[one]), own[one]) for one in own if rest[one]},
+            "training concepts": rate(action, limits[action], others),
+        }
+        if action == "arm circle":
+            turned = {one: (arm_rotation(states) >= measures.FULL_TURN).all(dim=-1) for one, states in own.items()}
+            found[action]["full turn"] = {one: round(float(full.float().mean()), 4) for one, full in turned.items()}
+    if not chosen.check:
+        write_text(FILE, json.dumps(limits, indent=1) + "\n")
     text = json.dumps({"windows of training concepts": len(others), **found}, indent=1) + "\n"
     print(text)
     write_text(chosen.out, text)

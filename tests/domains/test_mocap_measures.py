@@ -1,4 +1,5 @@
 import math
+from functools import partial
 
 import pytest
 import torch
@@ -8,7 +9,7 @@ from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.mocap import measures
 from ftl_lightning.domains.mocap.domain import BLENDED, DOMAIN, VIEWS, begun_elsewhere, smoothed, with_rigid_bones
 from ftl_lightning.domains.mocap.judge import Judge
-from ftl_lightning.domains.mocap.measures import RULES, bone_error, jerk, rise
+from ftl_lightning.domains.mocap.measures import CONDITIONS, THRESHOLDS, bone_error, jerk, rise, satisfied
 from ftl_lightning.domains.mocap.skeleton import (
     FPS,
     HORIZON,
@@ -24,6 +25,7 @@ from ftl_lightning.domains.mocap.skeleton import (
     standing_poses,
     walking_poses,
 )
+from ftl_lightning.domains.mocap.tasks import SUITES
 from ftl_lightning.services.errors import UserError
 from tests.domains.mocap_samples import script
 
@@ -62,7 +64,7 @@ def circle(turns: float = 1.0, narrow: float = 1.0) -> Tensor:
 
 
 def test_a_jumping_jack_needs_hands_and_feet_in_time() -> None:
-    rule = RULES["jumping jacks"]
+    rule = partial(satisfied, "jumping jacks")
     assert rule(jack()).tolist() == [True]
     assert rule(jack(hands=0.4)).tolist() == [False], "hands that stay below the head"
     assert rule(jack(feet=0.2)).tolist() == [False], "feet that hardly open"
@@ -80,13 +82,13 @@ def test_a_jumping_jack_needs_hands_and_feet_in_time() -> None:
 
 
 def test_an_arm_circle_needs_a_turn_on_a_round_path() -> None:
-    rule = RULES["arm circle"]
+    rule = partial(satisfied, "arm circle")
     assert rule(circle()).tolist() == [True]
     assert rule(circle(turns=-1)).tolist() == [True], "the other way round"
     assert rule(circle(turns=0.5)).tolist() == [False]
     assert rule(circle(narrow=0)).tolist() == [False], "up and down"
     assert rule(person()).tolist() == [False]
-    assert measures.arm_rotation(circle()).mean().item() == pytest.approx(360, abs=10)
+    assert measures.arm_rotation(circle()).mean().item() == pytest.approx(measures.FULL_TURN, abs=10)
     raised = person()
     as_joints(raised)[0, :, [R_WRIST, L_WRIST], 2] += TIME[:, None]
     assert rule(raised).tolist() == [False], "arms that are raised without a turn"
@@ -94,17 +96,28 @@ def test_an_arm_circle_needs_a_turn_on_a_round_path() -> None:
 
 def test_knees_are_raised_one_at_a_time_and_bent_together_in_a_squat() -> None:
     raised = person()
-    as_joints(raised)[0, :, R_KNEE, 2] += 0.35 * PHASE
-    assert RULES["knee raise"](raised).tolist() == [True]
-    assert RULES["knee raise"](person()).tolist() == [False]
+    as_joints(raised)[0, :, R_KNEE, 2] += 0.45 * PHASE
+    assert satisfied("knee raise", raised).tolist() == [True]
+    assert satisfied("knee raise", person()).tolist() == [False]
     squatting = person()
     joints = as_joints(squatting)
     joints[0, :, [R_KNEE, L_KNEE], 1] += 0.35 * PHASE[:, None]
     joints[0, :, [R_KNEE, L_KNEE], 2] += 0.2 * PHASE[:, None]
     joints[0, :, [R_ANKLE, L_ANKLE], 2] += 0.4 * PHASE[:, None]
-    assert RULES["squat"](squatting).tolist() == [True]
-    assert RULES["knee raise"](squatting).tolist() == [False]
-    assert RULES["squat"](person()).tolist() == [False]
+    assert satisfied("squat", squatting).tolist() == [True]
+    assert satisfied("knee raise", squatting).tolist() == [False]
+    assert satisfied("squat", person()).tolist() == [False]
+
+
+def test_thresholds_are_those_of_the_conditions_and_refuse_people_who_stand() -> None:
+    assert {action: {*limits} for action, limits in THRESHOLDS.items()} == {action: {*own} for action, own in CONDITIONS.items()}
+    assert {*CONDITIONS} == {*SUITES["more"].goals}
+    for action in CONDITIONS:
+        assert not satisfied(action, people(20)).any(), action
+    assert measures.rule("up down", people(1), None).tolist() == [0]
+    assert measures.recognised("up down", people(1), None).isnan().all(), "the judge does not know it"
+    turned = measures.full_turn("arm circle", torch.cat([circle(turns=1.1), circle(turns=0.8)]), None)
+    assert turned.tolist() == [1, 0]
 
 
 def test_level_starts_and_strides_are_counted_apart_and_nothing_is_said_of_other_goals() -> None:
@@ -114,7 +127,7 @@ def test_level_starts_and_strides_are_counted_apart_and_nothing_is_said_of_other
     assert measures.rule("jumping jacks", states, starts).tolist() == [1, 0]
     assert measures.level("jumping jacks", states, starts).nan_to_num(-1).tolist() == [1, -1]
     assert measures.strides("jumping jacks", states, starts).nan_to_num(-1).tolist() == [-1, 0]
-    for name in ("rule", "level", "strides", "feet in time", "degrees turned"):
+    for name in ("rule", "level", "strides", "full turn", "feet in time", "degrees turned"):
         assert DOMAIN.measure("walk", states, starts)[name].isnan().all(), name
     assert DOMAIN.measure("jumping jacks", states, starts)["amplitude of feet"][0] == pytest.approx(0.4, abs=0.01)
 

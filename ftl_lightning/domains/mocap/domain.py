@@ -104,7 +104,8 @@ states. ``steps`` has differences of poses, for autoregressive methods."""
 
 _DRAWING, _MEASURES = "ftl_lightning.domains.mocap.rendering", "ftl_lightning.domains.mocap.measures"
 
-_KINEMATIC = ("rule", "level", "strides", "rise", "feet in time", "amplitude of hands", "amplitude of feet", "degrees turned")
+_PARTS = ("full turn", "feet in time", "amplitude of hands", "amplitude of feet", "degrees turned")
+_KINEMATIC = ("rule", "level", "strides", "rise", *_PARTS)
 """Metrics of :mod:`~ftl_lightning.domains.mocap.measures` without the judge, by name."""
 
 
@@ -119,7 +120,7 @@ DOMAIN = Domain(
     concepts=Concepts(
         training=TRAINING_CONCEPTS,
         suites=SUITES | {"training": training_suite(tuple(text for text in TRAINING_CONCEPTS if action(text) in TESTED))},
-        descriptions=(*TRAINING_CONCEPTS, *NEW_CONCEPTS),
+        descriptions=(*TRAINING_CONCEPTS, *NEW_CONCEPTS, *SUITES["whole"].goals),
         reads=judged,
         table=Path(__file__).parent / "embeddings.safetensors",
     ),

@@ -1,10 +1,13 @@
 """Measures of generated motion: kinematic rules of actions, the judge, and naturalness.
 
-Rules need no training and are calibrated on recordings: a second opinion beside the judge. Metrics map
+Rules need no training and are set from recordings: a second opinion beside the judge. Metrics map
 ``(goal, states (sample, 32, 42), initial states or None) -> (sample,)``.
 """
 
+import json
 from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,22 +15,26 @@ from torch import Tensor
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.mocap import skeleton
 from ftl_lightning.domains.mocap.judge import shipped_judge
-from ftl_lightning.domains.mocap.skeleton import ANKLES, FPS, HIPS, KNEES, L_ANKLE, POSE, R_ANKLE, SHOULDERS, WRISTS, as_joints
+from ftl_lightning.domains.mocap.skeleton import (
+    ANKLES,
+    FPS,
+    HEAD,
+    HIPS,
+    KNEES,
+    L_ANKLE,
+    POSE,
+    R_ANKLE,
+    SHOULDERS,
+    WRISTS,
+    as_joints,
+)
+from ftl_lightning.domains.mocap.tasks import MORE_CONCEPTS, actions
 
 STRIDE = 0.3  # Minimum ankle distance in metres of a stride; closer ankles are a level pose
-SETTLED = 12  # First frame that is independent of the initial pose; synchrony and arm paths are judged from here
-OVERHEAD = -0.12
-"""Jumping jacks: minimum height in metres of both wrists at once above the top of the head; bent arms stay a little below it."""
-OPENED, OPEN = 0.2, 0.4  # Jumping jacks: minimum range and minimum peak of the sideways distance of the feet, in metres
-HANGING = 0.15  # Jumping jacks: minimum depth in metres of the hands below the shoulders at some time
-IN_TIME = 0.6  # Minimum absolute correlation of hand height and foot distance that counts as synchronous, in phase or in antiphase
-TURN = 240.0  # Minimum rotation of the arms in degrees in an arm circle, as a mean; two thirds for each arm
-WIDTH, ROUND = 0.12, 0.2  # Minimum width of the wrists' path, in metres and relative to its length, of a round path
-RAISED, LOWERED = 0.15, 0.3
-"""Knee raise, in metres below the hips: maximum of a raised knee; minimum of this knee at another time, and of the other knee."""
-BENT, STRETCHED = 70.0, 30.0  # Squat, in degrees: minimum flexion of both knees at once, and minimum range of this flexion
+SETTLED = 10  # First frame that is judged: a third of a second after the initial pose
+FULL_TURN = 360.0 * (skeleton.HORIZON - SETTLED - 2) / (skeleton.HORIZON - 1)
+"""Degrees by which :func:`arm_rotation` measures an even full turn within a plan."""
 TREMBLING = 900.0  # Maximum jerk of an action in metres per second cubed: the 99th percentile of recorded windows
-UPRIGHT, ON_FEET = 0.35, 0.5  # Minimum distances in metres from the hips up to the neck, and down to each ankle, of an upright pose
 
 
 def is_stride(poses: Tensor) -> Tensor:
@@ -36,114 +43,224 @@ def is_stride(poses: Tensor) -> Tensor:
     return torch.linalg.vector_norm(joints[:, R_ANKLE] - joints[:, L_ANKLE], dim=-1) > STRIDE
 
 
-def _hands(states: Tensor) -> Tensor:
-    """Mean height of both wrists ``(sample, frame)`` in metres."""
-    return as_joints(states)[..., list(WRISTS), 2].mean(dim=-1)
-
-
-def _feet(states: Tensor) -> Tensor:
-    """Sideways distance of the ankles ``(sample, frame)`` in metres; negative for crossed feet."""
-    joints = as_joints(states)
-    return joints[..., R_ANKLE, 0] - joints[..., L_ANKLE, 0]
-
-
-def _range(values: Tensor) -> Tensor:
-    return values.amax(dim=1) - values.amin(dim=1)
-
-
-def upright(states: Tensor) -> Tensor:
-    """Whether all poses stand or hop upright on both feet: ``(sample,)`` of bool."""
-    height = as_joints(states)[..., 2]
-    return (height[..., skeleton.NECK] > UPRIGHT).all(dim=1) & (height[..., list(ANKLES)] < -ON_FEET).all(dim=-1).all(dim=1)
-
-
 def jerk(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
     """Mean jerk ``(sample,)``: size of the joints' third derivative in metres per second cubed."""
     third = torch.diff(as_joints(states), n=3, dim=1) * FPS**3
     return torch.linalg.vector_norm(third, dim=-1).mean(dim=(1, 2))
 
 
-def calm(states: Tensor) -> Tensor:
-    """Whether jerk is below that of recordings: ``(sample,)`` of bool. Jumping joints would pass through any pose."""
-    return jerk("", states, None) < TREMBLING
+def _settled(states: Tensor) -> Tensor:
+    """Joints ``(sample, frame, 14, 3)`` from :data:`SETTLED` on."""
+    return as_joints(states)[:, SETTLED:]
 
 
-def synchronous(states: Tensor) -> Tensor:
-    """Whether feet open and close in time with the hands, in phase or in antiphase: ``(sample,)`` of bool."""
-    settled = states[:, SETTLED:]
-    hands, feet = (values - values.mean(dim=1, keepdim=True) for values in (_hands(settled), _feet(settled)))
+def _range(values: Tensor) -> Tensor:
+    """Range over frames: ``(sample, frame)`` to ``(sample,)``."""
+    return values.amax(dim=1) - values.amin(dim=1)
+
+
+def _height(states: Tensor, joints: tuple[int, ...]) -> Tensor:
+    return _settled(states)[..., list(joints), 2]
+
+
+def _hands(states: Tensor) -> Tensor:
+    """Mean height of both wrists ``(sample, frame)`` in metres."""
+    return _height(states, WRISTS).mean(dim=-1)
+
+
+def _hands_above_head(states: Tensor) -> Tensor:
+    """Greatest height of the lower wrist above the top of the head, in metres."""
+    return (_height(states, WRISTS).amin(dim=-1) - _height(states, (HEAD,))[..., 0]).amax(dim=1)
+
+
+def _hands_above_shoulders(states: Tensor) -> Tensor:
+    """Heights of the wrists above the shoulders ``(sample, frame, side)`` in metres."""
+    return _height(states, WRISTS) - _height(states, SHOULDERS)
+
+
+def _uneven_hands(states: Tensor) -> Tensor:
+    """Greatest difference in height of the wrists, in metres."""
+    return (_height(states, WRISTS) @ states.new_tensor((1.0, -1.0))).abs().amax(dim=1)
+
+
+def _feet(states: Tensor) -> Tensor:
+    """Sideways distance of the ankles ``(sample, frame)`` in metres; negative for crossed feet."""
+    joints = _settled(states)
+    return joints[..., R_ANKLE, 0] - joints[..., L_ANKLE, 0]
+
+
+def _strides(states: Tensor) -> Tensor:
+    """Greatest distance of the ankles to the front, in metres."""
+    joints = _settled(states)
+    return (joints[..., R_ANKLE, 1] - joints[..., L_ANKLE, 1]).abs().amax(dim=1)
+
+
+def _in_time(states: Tensor) -> Tensor:
+    """Absolute correlation of hand height and sideways distance of the feet: in phase or in antiphase."""
+    hands, feet = (values - values.mean(dim=1, keepdim=True) for values in (_hands(states), _feet(states)))
     size = torch.linalg.vector_norm(hands, dim=1) * torch.linalg.vector_norm(feet, dim=1)
-    together = (hands * feet).sum(dim=1) / size.clamp_min(1e-6)
-    wide = (_range(_feet(settled)) >= OPENED) & (_feet(settled).amax(dim=1) >= OPEN)
-    return (together.abs() >= IN_TIME) & wide
+    return (hands * feet).sum(dim=1).abs() / size.clamp_min(1e-6)
 
 
-def jumping_jacks(states: Tensor) -> Tensor:
-    """Hands overhead and down, feet open and closed in time with them, upright: ``(sample,)`` of bool."""
-    joints = as_joints(states)
-    wrists = joints[..., list(WRISTS), 2]
-    up = wrists.amin(dim=-1) - joints[..., skeleton.HEAD, 2] > OVERHEAD
-    down = (wrists < joints[..., list(SHOULDERS), 2] - HANGING).all(dim=-1)
-    return up.any(dim=1) & down.any(dim=1) & synchronous(states) & upright(states) & calm(states)
+def _neck(states: Tensor) -> Tensor:
+    """Smallest cosine of the angle between the vertical and the line from the hips to the neck: 1 for an upright trunk."""
+    neck = _settled(states)[..., skeleton.NECK, :]
+    return (neck[..., 2] / torch.linalg.vector_norm(neck, dim=-1).clamp_min(1e-3)).amin(dim=1)
+
+
+def _legs(states: Tensor) -> Tensor:
+    """Smallest height of the hips above the higher ankle, in lengths of the legs: 1 for straight legs."""
+    first = as_joints(states)[:, 0]
+    bones = (first[:, list(HIPS)] - first[:, list(KNEES)], first[:, list(KNEES)] - first[:, list(ANKLES)])
+    length = sum(torch.linalg.vector_norm(bone, dim=-1).mean(dim=-1) for bone in bones)
+    return -_height(states, ANKLES).amax(dim=(1, 2)) / torch.as_tensor(length).clamp_min(1e-3)
 
 
 def _paths(states: Tensor) -> Tensor:
-    """Paths of both wrists from the side, relative to the shoulders ``(sample, frame, 2, 2)``, centred from :data:`SETTLED` on."""
-    joints = as_joints(states)
-    paths = (joints[..., list(WRISTS), :] - joints[..., list(SHOULDERS), :])[..., 1:]
-    settled = paths[:, SETTLED:]
-    return paths - (settled.amax(dim=1, keepdim=True) + settled.amin(dim=1, keepdim=True)) / 2
+    """Paths of both wrists from the side, relative to the shoulders: ``(sample, frame, side, 2)`` in metres."""
+    joints = _settled(states)
+    return (joints[..., list(WRISTS), :] - joints[..., list(SHOULDERS), :])[..., 1:]
 
 
 def arm_rotation(states: Tensor) -> Tensor:
-    """Rotation of each arm about the centre of its wrist's path, from the side: degrees ``(sample, side)``; opposites cancel."""
-    paths = _paths(states)
-    angles = torch.atan2(paths[..., 1], paths[..., 0])
-    steps = torch.remainder(torch.diff(angles, dim=1) + torch.pi, 2 * torch.pi) - torch.pi
-    return torch.rad2deg(steps.sum(dim=1).abs())
+    """Turn of the direction of each wrist's motion relative to the shoulder, from the side: degrees ``(sample, side)``.
+
+    Opposite turns cancel. A part of a circle counts by its angle, wherever its centre is.
+    """
+    step = torch.diff(_paths(states), dim=1)
+    angles = torch.atan2(step[..., 1], step[..., 0])
+    turns = torch.remainder(torch.diff(angles, dim=1) + torch.pi, 2 * torch.pi) - torch.pi
+    return torch.rad2deg(turns.sum(dim=1).abs())
 
 
-def arm_circle(states: Tensor) -> Tensor:
-    """Whether upright arms rotate by :data:`TURN` on round paths: ``(sample,)`` of bool."""
-    paths = _paths(states)[:, SETTLED:].transpose(1, 2)
-    size = torch.linalg.svdvals(paths - paths.mean(dim=-2, keepdim=True))  # (sample, side, 2)
-    width = 8**0.5 * size / (states.shape[1] - SETTLED) ** 0.5  # diameter of a circle
-    wide = (width[..., 1] >= WIDTH) & (size[..., 1] >= ROUND * size[..., 0])
-    turned = arm_rotation(states)
-    return calm(states) & upright(states) & (wide & (turned >= TURN * 2 / 3)).all(dim=-1) & (turned.mean(dim=-1) >= TURN)
+def _path_width(states: Tensor) -> Tensor:
+    """Smaller width of the wrists' paths in metres: the diameter of circles."""
+    paths = _paths(states).transpose(1, 2)
+    size = torch.linalg.svdvals(paths - paths.mean(dim=-2, keepdim=True))[..., 1]
+    return (8**0.5 * size / paths.shape[-2] ** 0.5).amin(dim=-1)
 
 
-def knee_raise(states: Tensor) -> Tensor:
-    """Whether a knee is raised, and down at another time: ``(sample,)`` of bool."""
-    below = as_joints(states)[..., list(HIPS), 2] - as_joints(states)[..., list(KNEES), 2]
-    raised = (below < RAISED) & (below.flip(-1) > LOWERED)
-    return (raised.any(dim=1) & (below.amax(dim=1) > LOWERED)).any(dim=-1) & calm(states)
+def arms_out(states: Tensor) -> Tensor:
+    """Mean sideways distance of the wrist from the shoulder, of the nearer arm, in metres ``(sample,)``."""
+    joints = _settled(states)
+    sideways = joints[..., list(WRISTS), 0] - joints[..., list(SHOULDERS), 0]
+    return (sideways * states.new_tensor((1.0, -1.0))).mean(dim=1).amin(dim=-1)
 
 
-def squat(states: Tensor) -> Tensor:
-    """Whether both knees are bent at once, and stretched at another time: ``(sample,)`` of bool."""
-    joints = as_joints(states)
+def _knees(states: Tensor) -> Tensor:
+    """Heights of the knees relative to the hips ``(sample, frame, side)`` in thighs; the knee that is raised more is first."""
+    first = as_joints(states)[:, 0]
+    thighs = torch.linalg.vector_norm(first[:, list(KNEES)] - first[:, list(HIPS)], dim=-1).clamp_min(1e-3)
+    knees = (_height(states, KNEES) - _height(states, HIPS)) / thighs[:, None]
+    first = knees.amax(dim=1).argmax(dim=1)
+    return torch.where(first[:, None, None] == 0, knees, knees.flip(-1))
+
+
+def _other_knee(states: Tensor) -> Tensor:
+    """Height of the lower knee when the other is highest, see :func:`_knees`."""
+    raised, other = _knees(states).unbind(dim=-1)
+    return other.gather(1, raised.argmax(dim=1, keepdim=True))[:, 0]
+
+
+def _bend(states: Tensor) -> Tensor:
+    """Flexion of the straighter knee ``(sample, frame)`` in degrees."""
+    joints = _settled(states)
     thigh = joints[..., list(KNEES), :] - joints[..., list(HIPS), :]
     shank = joints[..., list(ANKLES), :] - joints[..., list(KNEES), :]
-    bend = torch.rad2deg(torch.arccos(torch.cosine_similarity(thigh, shank, dim=-1).clamp(-1, 1)))
-    both = bend.amin(dim=-1)
-    return (both.amax(dim=1) > BENT) & (_range(both) > STRETCHED) & calm(states)
+    return torch.rad2deg(torch.arccos(torch.cosine_similarity(thigh, shank, dim=-1).clamp(-1, 1))).amin(dim=-1)
 
 
-RULES: Mapping[str, Callable[[Tensor], Tensor]] = {
-    "jumping jacks": jumping_jacks,
-    "arm circle": arm_circle,
-    "knee raise": knee_raise,
-    "squat": squat,
+def _shoulder_yaw(states: Tensor) -> Tensor:
+    """Yaw of the shoulders relative to the hips ``(sample, frame)`` in degrees."""
+    joints = _settled(states)
+    across = joints[..., skeleton.R_SHOULDER, :] - joints[..., skeleton.L_SHOULDER, :]
+    return torch.rad2deg(torch.atan2(across[..., 1], across[..., 0]))
+
+
+def _hands_to_feet(states: Tensor) -> Tensor:
+    """Distance of each wrist to the nearer ankle ``(sample, frame, side)`` in metres."""
+    joints = _settled(states)
+    return torch.cdist(joints[..., list(WRISTS), :], joints[..., list(ANKLES), :]).amin(dim=-1)
+
+
+class Condition(NamedTuple):
+    """Part of a rule: a measure ``(sample, frame, 42) -> (sample,)``, and whether its threshold is a minimum or a maximum."""
+
+    measure: Callable[[Tensor], Tensor]
+    least: bool = True
+
+
+_BENT = {
+    "lowest neck": Condition(lambda states: _height(states, (skeleton.NECK,))[..., 0].amin(dim=1), least=False),
+    "range of neck": Condition(lambda states: _range(_height(states, (skeleton.NECK,))[..., 0])),
 }
-"""Rules of actions by goal, from windows ``(sample, frame, 42)`` to ``(sample,)`` of bool."""
+CONDITIONS: Mapping[str, Mapping[str, Condition]] = {
+    "jumping jacks": {
+        "hands up": Condition(_hands_above_head),
+        "hands down": Condition(lambda states: _hands_above_shoulders(states).amax(dim=-1).amin(dim=1), least=False),
+        "range of feet": Condition(lambda states: _range(_feet(states))),
+        "level feet": Condition(_strides, least=False),
+        "feet in time": Condition(_in_time),
+        "neck": Condition(_neck),
+    },
+    "arm circle": {
+        "turn": Condition(lambda states: arm_rotation(states).amin(dim=-1)),
+        "arms out": Condition(arms_out),
+        "width of paths": Condition(_path_width),
+        "neck": Condition(_neck),
+    },
+    "knee raise": {
+        "knee up": Condition(lambda states: _knees(states)[..., 0].amax(dim=1)),
+        "range of knee": Condition(lambda states: _range(_knees(states)[..., 0])),
+        "other knee": Condition(_other_knee, least=False),
+    },
+    "squat": {
+        "bend": Condition(lambda states: _bend(states).amax(dim=1)),
+        "range of bend": Condition(lambda states: _range(_bend(states))),
+    },
+    "twist": {
+        "range of shoulders": Condition(lambda states: _range(_shoulder_yaw(states))),
+        "hands": Condition(lambda states: _hands_above_shoulders(states).mean(dim=(1, 2))),
+        "legs": Condition(_legs),
+        "neck": Condition(_neck),
+    },
+    "toe touch one hand": {**_BENT, "uneven hands": Condition(_uneven_hands)},
+    "toe touch two hands": {
+        **_BENT,
+        "hands to feet": Condition(lambda states: _hands_to_feet(states).amax(dim=-1).amin(dim=1), least=False),
+        "uneven hands": Condition(_uneven_hands, least=False),
+    },
+    "up down": {
+        "range of hands": Condition(lambda states: _range(_hands(states))),
+        "uneven hands": Condition(_uneven_hands, least=False),
+    },
+}
+"""Conditions of each action's rule, by name."""
+THRESHOLDS: Mapping[str, Mapping[str, float]] = json.loads((Path(__file__).parent / "rules.json").read_text(encoding="utf-8"))
+"""Thresholds of :data:`CONDITIONS`, set from recordings alone by ``benchmarks/experiments/mocap_rules.py``, before any sample."""
+
+
+def holds(action: str, name: str, states: Tensor) -> Tensor:
+    """Whether a condition of an action's rule holds in windows ``(sample, frame, 42)``: ``(sample,)`` of bool."""
+    measure, least = CONDITIONS[action][name]
+    values, threshold = measure(states), THRESHOLDS[action][name]
+    return values >= threshold if least else values <= threshold
+
+
+def satisfied(action: str, states: Tensor) -> Tensor:
+    """Whether windows ``(sample, frame, 42)`` satisfy an action's rule without trembling: ``(sample,)`` of bool."""
+    calm = jerk("", states, None) < TREMBLING  # trembling joints would pass through any pose
+    return torch.stack([holds(action, name, states) for name in CONDITIONS[action]]).all(dim=0) & calm
+
 
 _RIGID = [skeleton.BONES.index(bone) for bone in skeleton.RIGID]
 
 
 def recognised(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
-    """Whether the shipped judge recognises the goal: ``(sample,)`` of bool, see :meth:`.Judge.recognised`."""
-    return shipped_judge().recognised(goal, states)
+    """Whether the shipped judge recognises the goal: ``(sample,)`` of 0 and 1, see :meth:`.Judge.recognised`; NaN if it cannot."""
+    if goal in MORE_CONCEPTS and not actions(goal):
+        return states.new_full((len(states),), torch.nan)
+    return shipped_judge().recognised(goal, states).float()
 
 
 def _first(states: Tensor, starts: InitialStates | None) -> Tensor:
@@ -166,8 +283,8 @@ def rise(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
 
 
 def rule(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
-    """Whether the goal's rule of :data:`RULES` holds: ``(sample,)`` of 0 and 1; NaN for goals without a rule."""
-    return RULES[goal](states).float() if goal in RULES else states.new_full((len(states),), torch.nan)
+    """Whether the goal's rule of :data:`CONDITIONS` holds: ``(sample,)`` of 0 and 1; NaN for goals without a rule."""
+    return satisfied(goal, states).float() if goal in CONDITIONS else states.new_full((len(states),), torch.nan)
 
 
 def level(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
@@ -189,8 +306,10 @@ def _limited(limit: str, measure: Callable[[Tensor], Tensor]) -> Callable[[str, 
     return measured
 
 
-feet_in_time = _limited("jumping jacks", synchronous)
+feet_in_time = _limited("jumping jacks", lambda states: holds("jumping jacks", "feet in time", states))
 amplitude_of_hands = _limited("jumping jacks", lambda states: _range(_hands(states)))
 amplitude_of_feet = _limited("jumping jacks", lambda states: _range(_feet(states)))
 degrees_turned = _limited("arm circle", lambda states: arm_rotation(states).mean(dim=-1))
-"""Parts of rules: vertical range of the hands and range of the feet's sideways distance in metres, mean rotation of the arms."""
+full_turn = _limited("arm circle", lambda states: (arm_rotation(states) >= FULL_TURN).all(dim=-1) & satisfied("arm circle", states))
+"""Parts of rules: vertical range of the hands and range of the feet's sideways distance in metres, mean rotation of the arms, and
+whether the rule holds and both arms turn by :data:`FULL_TURN`."""

@@ -252,15 +252,15 @@ class Recorded:
         return validation_trials(self._pieces)
 
     def _shown(self, task: str) -> list[Piece]:
-        """Pieces of a new concept by its demonstrators."""
-        recordings, shown = self.recordings, []
+        """Pieces of a new concept by its demonstrators; if it has none, by anyone."""
+        recordings, shown = self.recordings, dict[bool, list[Piece]]()
         for segment in self.segments:
             if segment.label == task and segment.trial_id in recordings.trial_id:
                 trial = recordings.trial_id.index(segment.trial_id)
-                if recordings.subject[trial] in DEMONSTRATORS:
-                    parts = pieces(recordings.trial(trial)[segment.start : segment.stop], longest=None)
-                    shown += [Piece(trial, task, states) for states in parts]
-        return shown
+                parts = pieces(recordings.trial(trial)[segment.start : segment.stop], longest=None)
+                own = shown.setdefault(recordings.subject[trial] in DEMONSTRATORS, [])
+                own += [Piece(trial, task, states) for states in parts]
+        return shown.get(True) or shown.get(False, [])
 
     def _demonstrations(self, chosen: Sequence[Piece], provenance: dict[str, object]) -> Demonstrations:
         trials = [self.recordings.trial_id[piece.trial] for piece in chosen]

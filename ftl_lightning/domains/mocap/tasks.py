@@ -26,7 +26,9 @@ STAND_INS = ("arm circle",)  # Replacements of the paper's two other new concept
 DATABASE_CONCEPTS = ("chop wood", "breaststroke")  # New concepts of the paper in few copies of the database
 TEST_CONCEPTS = (*PAPER_CONCEPTS, *STAND_INS)
 VALIDATION_CONCEPTS = ("knee raise", "squat")
-NEW_CONCEPTS = (*TEST_CONCEPTS, *VALIDATION_CONCEPTS, *DATABASE_CONCEPTS)
+MORE_CONCEPTS = ("twist", "toe touch one hand", "toe touch two hands", "up down")
+"""Further actions of the held-out trials; a single person each shows the last three."""
+NEW_CONCEPTS = (*TEST_CONCEPTS, *VALIDATION_CONCEPTS, *DATABASE_CONCEPTS, *MORE_CONCEPTS)
 AND = " + "  # Separator of the concepts of a goal
 COMPOSED_WITH = ("walk", "jump")
 _RENAMED = {"zombiewalk": "zombie walk", "heiansyodan": "heian shodan"}
@@ -44,10 +46,17 @@ def mirrored_text(text: str) -> str:
     return re.sub(r"\b(left|right)\b", lambda side: _SIDES[side[0]], text)
 
 
+def _alone(concepts: tuple[str, ...]) -> tuple[EvaluationTask, ...]:
+    """New concepts from new poses."""
+    return tuple(EvaluationTask("new concept", text, (text,)) for text in concepts)
+
+
 def _new(concepts: tuple[str, ...]) -> tuple[EvaluationTask, ...]:
     """New concepts from new poses, and from initial poses of the demonstrations."""
-    new = (EvaluationTask("new concept", text, (text,)) for text in concepts)
-    return (*new, *(EvaluationTask("new concept, demonstrated poses", text, (text,), initial="demonstrated") for text in concepts))
+    return (
+        *_alone(concepts),
+        *(EvaluationTask("new concept, demonstrated poses", text, (text,), initial="demonstrated") for text in concepts),
+    )
 
 
 def _composed(concepts: tuple[str, ...]) -> tuple[EvaluationTask, ...]:
@@ -76,9 +85,11 @@ SUITES = {
     "whole": Suite(_composed(TEST_CONCEPTS)),
     "database": Suite(_new(DATABASE_CONCEPTS)),
     "validation": Suite(_new(VALIDATION_CONCEPTS)),
+    "more": Suite(_alone((*TEST_CONCEPTS, *VALIDATION_CONCEPTS, *MORE_CONCEPTS))),
 }
 """``paper`` and ``protocol``, with the initial states of the paper, are for final evaluation; ``validation`` is for tuning.
-``database`` needs :data:`DATABASE_CONCEPTS` in the user's copy; ``whole`` is for methods that cannot compose by parts."""
+``more`` has every action that pretraining does not show, those of ``validation`` among them. ``database`` needs
+:data:`DATABASE_CONCEPTS` in the user's copy; ``whole`` is for methods that cannot compose by parts."""
 
 
 OTHER = "other"  # No action: motions of a single person, standing people, and windows without motion (a frozen frame, trembling)
@@ -116,8 +127,8 @@ def actions(goal: str) -> tuple[str, ...]:
 
 
 def judged(goal: str) -> bool:
-    """Whether a goal can be judged."""
-    return bool(actions(goal))
+    """Whether a goal can be judged, by the judge or by a rule."""
+    return bool(actions(goal)) or goal in MORE_CONCEPTS
 
 
 def of_legs(name: str) -> str:

@@ -113,7 +113,7 @@ def check_task(task: str) -> str:
     return task
 
 
-HAND, POINTS, MOVED = "hand", "points", "moved"
+HAND, POINTS, LEVEL, MOVED = "hand", "points", "level", "moved"
 ORIGIN = "origin"
 """Observed hand position in the image. View ``hand``: column and row, -1 to 1; view ``points``: x and y from the image centre, in
 half images."""
@@ -196,17 +196,23 @@ def noisy_keypoints(places: Tensor, draw: torch.Generator) -> Tensor:
     return torch.cat((visible * (centres + noise) / HALF, SURE * (2 * visible - 1)), dim=-1).transpose(1, 2).flatten(1)
 
 
-def _perturb(states: Tensor, observed: Observed, draw: torch.Generator | None) -> tuple[Tensor, Observed]:
-    if draw is None:  # no transformation of new tasks
+def _turned(states: Tensor, observed: Observed, draw: torch.Generator | None) -> tuple[Tensor, Observed]:
+    """Mirror, rotate and shift scenes at random; new tasks (``draw`` is ``None``) are not transformed."""
+    if draw is None:
         return states, observed
     count, device = len(states), states.device
     uniform = drawn(count, lambda n: torch.rand((n, 5), generator=draw, device=device))
     most = torch.where(uniform[:, 1] < 0.5, TURN, math.pi)
     angles, shifts = most * (2 * uniform[:, 2] - 1), SHIFT * (2 * uniform[:, 3:] - 1)
-    states, observed = moved(states, observed, uniform[:, 0] < 0.5, angles, shifts)
-    if IMAGE in observed:
+    return moved(states, observed, uniform[:, 0] < 0.5, angles, shifts)
+
+
+def _turned_and_raised(states: Tensor, observed: Observed, draw: torch.Generator | None) -> tuple[Tensor, Observed]:
+    """:func:`_turned`; half of the scenes without image are also raised, by up to :data:`RAISED`."""
+    states, observed = _turned(states, observed, draw)
+    if draw is None or IMAGE in observed:
         return states, observed
-    height = drawn(count, lambda n: torch.rand(n, generator=draw, device=device))
+    height = drawn(len(states), lambda n: torch.rand(n, generator=draw, device=states.device))
     return raised(states, observed, RAISED * (2 * height - 1).clamp(min=0))
 
 
@@ -228,19 +234,21 @@ _FROM_HAND = View(
     observe=_with_pixel,
     encode=lambda states, observed: states - _place(observed),
     decode=lambda states, observed: states + _place(observed),
-    perturb=_perturb,
+    perturb=_turned_and_raised,
 )
 VIEWS = {
     HAND: _FROM_HAND,
     POINTS: replace(_FROM_HAND, observe=_with_place, plane=(0, 1)),
+    LEVEL: replace(_FROM_HAND, observe=_with_place, plane=(0, 1), perturb=_turned),
     MOVED: View(
         features=FEATURES,
         observe=lambda observed: observed,
         encode=lambda states, observed: states,
         decode=lambda states, observed: states,
-        perturb=_perturb,
+        perturb=_turned_and_raised,
         same_columns=True,
     ),
 }
 """All views augment scenes. States are relative to the hand in ``hand`` and ``points``, absolute in ``moved``. ``points`` is for
-image encoders with x and y of objects. Keypoints can be relative to the hand, see :data:`ORIGIN`."""
+image encoders with x and y of objects; ``level`` is ``points`` without raised scenes, as in the paper.
+Keypoints can be relative to the hand, see :data:`ORIGIN`."""
