@@ -247,9 +247,11 @@ def read(text: str) -> tuple[dict[str, NDArray[np.float64]], float]:
     return {name: np.stack(own) for name, own in places.items()}, float(seconds.removeprefix("Frame Time: "))
 
 
-def joints(text: str) -> Tensor:
-    """Joints ``(frame, 14, 3)`` of a file, in the domain's axes."""
+def joints(text: str, from_hips: bool = True) -> Tensor:
+    """Joints ``(frame, 14, 3)`` of a file, in the domain's axes, seen from the hips or from the ground."""
     places, _ = read(text)
+    if from_hips:
+        places = {name: own - places["Hips"] for name, own in places.items()}
     found = [places[f"{name}.end"] for name in ENDS] + [places[joint.name] for joint in TREE if joint.place != HIPS]
     numbers = [*ENDS.values(), *(joint.place for joint in TREE if joint.place != HIPS)]
     x, y, z = np.moveaxis(np.stack(found, axis=1)[:, np.argsort(numbers)], -1, 0)
@@ -278,15 +280,33 @@ def test_forward_kinematics_of_a_file_gives_the_joints_back() -> None:
 def test_a_file_is_of_metres_y_up_facing_z_at_thirty_frames_a_second_and_somebody_stands_at_rest_in_it() -> None:
     places, seconds = read(bvh(standing_poses(1, torch.Generator().manual_seed(0))))
     assert seconds == pytest.approx(1 / 30, abs=1e-6)
-    assert 0.6 < places["Head"][0, 1] < 0.8
+    assert 1.5 < places["Head"][0, 1] < 1.6
     assert places["LeftUpLeg"][0, 0] > 0.08  # the person's left
     assert places["Head"][0, 2] > 0.05  # the head is before the hips
-    assert np.allclose(places["Hips"], 0)
+    assert min(places[f"{side}Leg.end"][0, 1] for side in ("Left", "Right")) == pytest.approx(0, abs=1e-5), "on the ground"
     states = standing_poses(1, torch.Generator().manual_seed(5))
     text = bvh(states)
     rows = text.splitlines()[-1].split()
     still = text.replace(text.splitlines()[-1], " ".join("0" if abs(float(one)) < 1e-3 else one for one in rows))
     assert float((joints(still) - as_joints(states)).abs().max()) < 1e-4  # it stands as it would at rest, and so nothing turns
+
+
+def test_who_walks_goes_along_and_the_lower_foot_does_not_slide() -> None:
+    """A stride of each leg in turn, seen from the hips: the foot that is down goes backwards, so the hips go forwards."""
+    frames = torch.arange(41)
+    states = as_joints(standing_poses(1, torch.Generator().manual_seed(0)).repeat(41, 1)).clone()
+    swing = torch.sin(2 * math.pi * frames / 20)
+    for side, (knee, ankle) in ((1, (skeleton.R_KNEE, skeleton.R_ANKLE)), (-1, (skeleton.L_KNEE, skeleton.L_ANKLE))):
+        lift = (side * torch.cos(2 * math.pi * frames / 20)).clamp(min=0)  # of the leg that swings forwards, with a bent knee
+        states[:, knee, 1] += side * 0.15 * swing + 0.25 * lift
+        states[:, ankle, 1] += side * 0.3 * swing
+        states[:, [knee, ankle], 2] += torch.stack((0.1 * lift, 0.25 * lift), dim=1)
+    seen = joints(bvh(with_rigid_bones(states.flatten(1)[None], {"pose": states[:1].flatten(1)})[0]), from_hips=False)
+    ankles = seen[:, list(skeleton.ANKLES)]
+    assert ankles[..., 2].amin(dim=1).abs().max() < 1e-4, "someone is on the ground in every frame"
+    lower = (ankles[1:, :, 2] + ankles[:-1, :, 2]).argmin(dim=1)
+    assert ankles.diff(dim=0)[torch.arange(40), lower, :2].abs().max() < 1e-4
+    assert seen[-1, skeleton.HEAD, 1] - seen[0, skeleton.HEAD, 1] > 1, "metres"
 
 
 def test_an_arm_overhead_does_not_spin() -> None:

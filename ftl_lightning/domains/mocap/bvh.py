@@ -232,7 +232,7 @@ def bvh(states: Tensor) -> str:
     """Convert a motion ``(frame, 42)`` in metres to the text of a BVH file; raise a ``UserError`` for numbers that are not finite.
 
     In the file y is up, the person faces +z, +x is the person's left, and the unit is the metre. The root is the middle of the
-    hips. Joints rotate; joints without rigid bone to the parent (shoulders, neck, head) also have a position per frame, as in
+    hips, see :func:`_grounded`. Joints rotate; joints without rigid bone to the parent (shoulders, neck, head) also have a position per frame, as in
     Blender. Bones have the lengths of the first frame and the rest directions of a standing pose. Rotations between frames are
     minimal, so that no arm spins about its axis.
     """
@@ -244,7 +244,7 @@ def bvh(states: Tensor) -> str:
     for joint in TREE:
         parent = HIPS if joint.parent < 0 else TREE[joint.parent].place
         above = turns[joint.parent] if joint.parent >= 0 else np.broadcast_to(np.eye(3), (len(places), 3, 3))
-        moved = _seen(above, places[:, joint.place] - places[:, parent]) if joint.parent >= 0 else places[:, HIPS]
+        moved = _seen(above, places[:, joint.place] - places[:, parent]) if joint.parent >= 0 else _grounded(places)
         offsets.append(_sized(rest[joint.place] - rest[parent], moved[0]) if joint.parent >= 0 else np.zeros(3))
         turn = np.broadcast_to(np.eye(3), (len(places), 3, 3))
         ends.append(np.array([0, TIP, 0]))
@@ -265,6 +265,19 @@ def _places(states: Tensor) -> Numbers:
     joints = np.stack((-joints[..., 0], joints[..., 2], joints[..., 1]), axis=-1)
     middle = joints[:, list(skeleton.HIPS)].mean(axis=1, keepdims=True)
     return np.concatenate((joints, middle), axis=1)
+
+
+def _grounded(places: Numbers) -> Numbers:
+    """Positions of the root ``(frame, 3)`` over the ground, y = 0: the lower ankle of two frames is on it and does not slide.
+
+    States have no root. Jumps stay on the ground, and the hips do not turn.
+    """
+    ankles = places[:, list(skeleton.ANKLES)]
+    lower = (ankles[1:, :, 1] + ankles[:-1, :, 1]).argmin(axis=1)
+    steps = np.diff(ankles, axis=0)[np.arange(len(lower)), lower]
+    root = -np.concatenate((np.zeros((1, 3)), np.cumsum(steps, axis=0)))
+    root[:, 1] = -ankles[..., 1].min(axis=1)
+    return root
 
 
 def _seen(turns: Numbers, ways: Numbers) -> Numbers:
