@@ -2,7 +2,6 @@
 
 import difflib
 import functools
-import logging
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, ClassVar
@@ -31,7 +30,6 @@ from ftl_lightning.services.text import Shown, counted
 from ftl_lightning.training.method import Method, class_path, method_of
 from ftl_lightning.training.model_config import ModelConfig, Prepared, find_view
 
-_LOG = logging.getLogger(__name__)
 KIND = "generative model"
 """Kind of a file of model weights."""
 NEAREST = 3
@@ -157,10 +155,6 @@ class ConceptModel(Shown, nn.Module, ABC):
             for concept in concepts.values():
                 self.check_sizes(concept)
             return concepts
-        pretrained = self.config.training.get("model", {}).get("loss", settings.loss.kind)
-        if pretrained != settings.loss.kind:
-            text = "model.loss.kind: the model was pretrained with %r; with %r concepts are learned worse"
-            _LOG.warning(text, pretrained, settings.loss.kind)
         return learn(self, demonstrations, settings, steps, tell, watch, start)
 
     def read_concepts(self, demonstrations: Demonstrations) -> dict[str, Concept]:
