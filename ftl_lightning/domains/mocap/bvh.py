@@ -232,9 +232,9 @@ def bvh(states: Tensor) -> str:
     """Convert a motion ``(frame, 42)`` in metres to the text of a BVH file; raise a ``UserError`` for numbers that are not finite.
 
     In the file y is up, the person faces +z, +x is the person's left, and the unit is the metre. The root is the middle of the
-    hips, see :func:`_grounded`. Joints rotate; joints without rigid bone to the parent (shoulders, neck, head) also have a position per frame, as in
-    Blender. Bones have the lengths of the first frame and the rest directions of a standing pose. Rotations between frames are
-    minimal, so that no arm spins about its axis.
+    hips, see :func:`_grounded`. Joints rotate; joints without rigid bone to the parent (shoulders, neck, head) also have a position
+    per frame, as in Blender. Bones have the lengths of the first frame and the rest directions of a standing pose. Rotations
+    between frames are minimal, so that no arm spins about its axis.
     """
     require(states.isfinite().all(), "export", "motion of finite numbers", "others; draw it again with another --seed")
     places = _places(states)

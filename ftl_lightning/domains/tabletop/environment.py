@@ -15,6 +15,7 @@ from ftl_lightning.domains.tabletop.interface import (
     FRONT,
     HERTZ,
     IMAGE,
+    LIFT,
     MAX_STEPS,
     OPEN,
     OVERHEAD,
@@ -23,11 +24,12 @@ from ftl_lightning.domains.tabletop.interface import (
     PUSH_ON_BOOK,
     PUSHES,
     THRESHOLD,
-    TO_BOOK,
     check_task,
 )
 from ftl_lightning.domains.tabletop.scenes import (
+    BESIDE_AT,
     BOOK,
+    BOWL,
     CIRCLE,
     COLUMNS,
     HAND,
@@ -36,7 +38,6 @@ from ftl_lightning.domains.tabletop.scenes import (
     SCENE,
     TARGET,
     TRIANGLE,
-    WHITE,
     check,
     draw_scene,
     gap,
@@ -192,10 +193,10 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         return self._observation()
 
     def _touches(self, name: str, places: dict[str, NDArray[np.float64]]) -> bool:
-        """Whether the circle touches an object from above, and is at the object's height."""
-        circle, place = places[CIRCLE], places[name]
+        """Whether the circle touches the side of an object from above, at the object's height; not in it or on it."""
+        circle, place, shape = places[CIRCLE], places[name], self.outline(name)
         level = abs(circle[2] - place[2]) < LIFTED if name == TRIANGLE else circle[2] < place[2] + HEIGHT[name] / 2
-        return level and touching(self.outline(name), circle)
+        return level and touching(shape, circle) and not within(circle[None, :2], shape)
 
     def outline(self, name: str) -> NDArray[np.float64]:
         """Current outline of an object, see :func:`~ftl_lightning.domains.tabletop.scenes.outline`."""
@@ -258,7 +259,9 @@ def touching(shape: NDArray[np.float64], circle: NDArray[np.float64]) -> bool:
 
 
 LEVEL = 0.008  # Tolerance in metres of the circle's height on a surface
-NEAR = 0.15  # Maximum centre distance in metres between the circle and the object beside it
+BY = 0.03  # Maximum centre distance in metres between the circle and the object beside it, above that of the expert
+HELD = 0.1  # Minimum height in metres of the centre of a lifted circle at the end
+CENTRED = 0.02  # Maximum offset in metres of the circle from the centre of the triangle under it, or of the bowl around it
 
 
 def judged(task: str, scene: NDArray[np.float32], info: Mapping[str, Any]) -> bool:
@@ -267,7 +270,9 @@ def judged(task: str, scene: NDArray[np.float32], info: Mapping[str, Any]) -> bo
     - Pushes to the triangle: circle and triangle touch (:data:`TOUCH`); both are still on their initial surface.
     - Pushes to another object: the circle has touched only this object, and lies on the table.
     - Picks to the book and to the white surface: the circle was lifted and released; it lies on the surface, its centre over it.
-    - Picks beside an object: the circle was lifted and released; it lies on the table, its centre within :data:`NEAR` of it.
+    - Picks to the triangle and to the bowl: the same; it lies on or in it, at most :data:`CENTRED` off its centre.
+    - Picks beside an object: the circle was lifted and released; it lies on the table, its centre near the object.
+    - Lift: at the end the circle is in the hand, at least :data:`HELD` above the table.
 
     ``scene (24,)`` is the initial scene, ``info`` that of the last step, empty without a step.
     """
@@ -281,15 +286,22 @@ def judged(task: str, scene: NDArray[np.float32], info: Mapping[str, Any]) -> bo
         surface = HEIGHT[BOOK] if task == PUSH_ON_BOOK else support(scene, CIRCLE)
         both = (circle, info["triangle"])
         return bool(info["touched"]) and all(place is not None and _lies(place, surface) for place in both)
+    if task == LIFT:
+        return bool(info["lifted"]) and not info["released"] and float(circle[2]) >= HELD
     if not (info["lifted"] and info["released"]):
         return False
-    if task in BESIDE:
-        thing = info["triangle"] if TARGET[task] == TRIANGLE else scene[COLUMNS[TARGET[task]]][1:4]
-        return _lies(circle, 0.0) and float(np.linalg.norm(circle[:2] - thing[:2])) <= NEAR
-    name = BOOK if task == TO_BOOK else WHITE
+    name = TARGET[task]
     x, y, yaw = map(float, scene[COLUMNS[name]][1:])
-    if task == TO_BOOK and info["book place"] is not None:
-        x, y = map(float, info["book place"][:2])
+    moved = info["triangle"] if name == TRIANGLE else info["book place"] if name == BOOK else None
+    if moved is not None:
+        x, y = map(float, moved[:2])
+    distance = float(np.linalg.norm(circle[:2] - (x, y)))
+    if task in BESIDE:
+        return _lies(circle, 0.0) and distance <= BESIDE_AT[name] + BY
+    if name == BOWL:
+        return float(circle[2]) < HEIGHT[BOWL] and distance <= CENTRED
+    if name == TRIANGLE:
+        return _lies(circle, HEIGHT[name]) and distance <= CENTRED
     return _lies(circle, HEIGHT[name]) and within(circle[None, :2], outline(name, x, y, yaw))
 
 

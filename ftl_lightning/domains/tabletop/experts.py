@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ftl_lightning.domains.recorder import reached
-from ftl_lightning.domains.tabletop.interface import AROUND_BOWL, MAX_STEPS, OPEN, PUSH_ON_BOOK, PUSHES, TO_BOOK, TO_WHITE
+from ftl_lightning.domains.tabletop.interface import AROUND_BOWL, BESIDE, LIFT, MAX_STEPS, OPEN, PUSH_ON_BOOK, PUSHES
 from ftl_lightning.domains.tabletop.scenes import (
     APART,
+    BESIDE_AT,
     BOOK,
     BOWL,
     CIRCLE,
@@ -23,6 +24,7 @@ from ftl_lightning.domains.tabletop.scenes import (
     HEIGHT,
     RING,
     TARGET,
+    TRIANGLE,
     WHITE,
     gap,
     outline,
@@ -132,7 +134,8 @@ ASTRAY, REACHED = ((0.32, 0.70), (-0.28, 0.28)), ((0.26, 0.77), (-0.35, 0.35))  
 OPENED, HIGHEST = 0.5, 0.16  # Recoveries of picks: probability of an open hand, and maximum hand height in metres above push height
 AROUND, ROOM, LONGEST_PUSH = (0.034, 0.08), 0.012, 0.33
 """Recoveries, in metres: range from hand to circle, minimum gap from circle to other objects, maximum from circle to target."""
-APART_FROM = 0.12  # Centre distance in metres between an object and the circle placed beside it; leaves room for open fingers
+SPREAD = {BOOK: 0.02, WHITE: 0.012, BOWL: 0.005, TRIANGLE: 0.003, CIRCLE: 0.0}
+"""Maximum offset in metres of a circle that a pick places on an object."""
 
 Moves = Generator[Place, None, None]  # Commands (4,) per step: x, y, z and gripper opening
 
@@ -217,6 +220,9 @@ def _pick(expert: _Expert) -> Moves:
     yield from expert.go(np.array([*over, support(scene, CIRCLE) + GRASP_HEIGHT]), 0.012, OPEN)
     yield from expert.wait(4, CLOSED)
     yield from expert.go(np.array([*over, HEIGHT[WHITE] + how.hover]), 0.014, CLOSED)
+    if expert.task == LIFT:
+        yield from expert.wait(6, CLOSED)
+        return
     target = target - (expert.circle()[:2] - expert.at[:2])
     yield from expert.go(np.array([*target, HEIGHT[WHITE] + how.hover]), 0.016, CLOSED)
     yield from expert.go(np.array([*target, surface + GRASP_HEIGHT + 0.003]), 0.012, CLOSED)
@@ -228,14 +234,14 @@ def _pick(expert: _Expert) -> Moves:
 def _target(expert: _Expert) -> tuple[Place, float]:
     """Return the goal of the circle and its surface height."""
     scene, how = expert.env.scene, expert.how
-    if expert.task in (TO_BOOK, TO_WHITE):
-        name, spread = (BOOK, 0.02) if expert.task == TO_BOOK else (WHITE, 0.012)
-        return scene[COLUMNS[name]][1:3].astype(np.float64) + spread * how.release, HEIGHT[name]
+    name = TARGET[expert.task]
+    if expert.task not in BESIDE:
+        return scene[COLUMNS[name]][1:3].astype(np.float64) + SPREAD[name] * how.release, HEIGHT[name]
     # The side of the object where the circle lay, which is invariant to rotations of the scene.
-    thing = scene[COLUMNS[TARGET[expert.task]]][1:3].astype(np.float64)
+    thing = scene[COLUMNS[name]][1:3].astype(np.float64)
     along = expert.circle()[:2] - thing
     along /= np.linalg.norm(along)
-    return thing + (APART_FROM + 0.005 * how.release[0]) * along + 0.01 * how.release[1] * np.array([-along[1], along[0]]), 0.0
+    return thing + (BESIDE_AT[name] + 0.005 * how.release[0]) * along + 0.01 * how.release[1] * np.array([-along[1], along[0]]), 0.0
 
 
 def _push(expert: _Expert, height: float) -> Moves:

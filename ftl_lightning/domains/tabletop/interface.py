@@ -82,13 +82,20 @@ PUSH_TO_BOWL = "push green circle to purple bowl"
 PUSH_TO_WHITE = "push green circle to elevated white surface"
 PUSH_TO_BOOK = "push green circle to book"
 BESIDE_TRIANGLE = "pick green circle to beside orange triangle"
+BESIDE_BOOK = "pick green circle to beside book"
+BESIDE_WHITE = "pick green circle to beside elevated white surface"
+TO_TRIANGLE = "pick green circle to orange triangle"
+TO_BOWL = "pick green circle to purple bowl"
+LIFT = "lift green circle"
 
 TRAINING_CONCEPTS = (TO_BOOK, TO_WHITE, PUSH, AROUND_BOWL)  # Training concepts of the paper
 WIDE_CONCEPTS = (*TRAINING_CONCEPTS, PUSH_TO_BOWL, PUSH_TO_WHITE, BESIDE_TRIANGLE)
 """Training concepts of the wide model: more pushes and picks, none of which is an evaluation task."""
-TASKS = (*TRAINING_CONCEPTS, PUSH_ON_BOOK, BESIDE_BOWL, PUSH_TO_BOWL, PUSH_TO_WHITE, PUSH_TO_BOOK, BESIDE_TRIANGLE)
+PAIRS = (PUSH_TO_BOOK, BESIDE_BOWL, BESIDE_BOOK, BESIDE_WHITE, TO_TRIANGLE, TO_BOWL)
+"""Pairs of a verb and an object that the wide model's pretraining shows separately."""
+TASKS = (*WIDE_CONCEPTS, PUSH_ON_BOOK, *PAIRS, LIFT)
 PUSHES = tuple(task for task in TASKS if task.startswith("push"))
-BESIDE = (BESIDE_BOWL, BESIDE_TRIANGLE)  # Picks that end on the table
+BESIDE = (BESIDE_BOWL, BESIDE_TRIANGLE, BESIDE_BOOK, BESIDE_WHITE)  # Picks that end on the table
 
 SUITES = {
     "training": training_suite(TRAINING_CONCEPTS),
@@ -103,8 +110,9 @@ WIDE_SUITES = {
     "paper": SUITES["paper"],
     "pairs": Suite((EvaluationTask("new concept", PUSH_TO_BOOK, (PUSH_TO_BOOK,)),)),
     "validation": SUITES["validation"],
+    "more": Suite(tuple(EvaluationTask("new concept", task, (task,)) for task in (*PAIRS, PUSH_ON_BOOK, LIFT))),
 }
-"""``pairs``: a verb and an object that pretraining shows separately."""
+"""``pairs``: a verb and an object that pretraining shows separately; ``more``: all :data:`PAIRS`, a lift and the paper's task."""
 
 
 def check_task(task: str) -> str:

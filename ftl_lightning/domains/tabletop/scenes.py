@@ -16,8 +16,11 @@ from torch import Tensor
 from ftl_lightning.domains.tabletop.interface import (
     AROUND_BOWL,
     BESIDE,
+    BESIDE_BOOK,
     BESIDE_BOWL,
     BESIDE_TRIANGLE,
+    BESIDE_WHITE,
+    LIFT,
     PUSH,
     PUSH_ON_BOOK,
     PUSH_TO_BOOK,
@@ -25,6 +28,8 @@ from ftl_lightning.domains.tabletop.interface import (
     PUSH_TO_WHITE,
     PUSHES,
     TO_BOOK,
+    TO_BOWL,
+    TO_TRIANGLE,
     TO_WHITE,
     check_task,
 )
@@ -42,6 +47,11 @@ TARGET = {
     TO_WHITE: WHITE,
     BESIDE_BOWL: BOWL,
     BESIDE_TRIANGLE: TRIANGLE,
+    BESIDE_BOOK: BOOK,
+    BESIDE_WHITE: WHITE,
+    TO_TRIANGLE: TRIANGLE,
+    TO_BOWL: BOWL,
+    LIFT: CIRCLE,
     PUSH: TRIANGLE,
     AROUND_BOWL: TRIANGLE,
     PUSH_ON_BOOK: TRIANGLE,
@@ -49,7 +59,9 @@ TARGET = {
     PUSH_TO_WHITE: WHITE,
     PUSH_TO_BOOK: BOOK,
 }
-"""Object to which a task brings the circle."""
+"""Object to which a task brings the circle; the circle itself for the lift."""
+BESIDE_AT = {BOWL: 0.12, TRIANGLE: 0.12, WHITE: 0.16, BOOK: 0.2}
+"""Centre distance in metres between an object and the circle placed beside it; leaves room for open fingers."""
 
 RADIUS = {CIRCLE: 0.025, BOWL: 0.05, TRIANGLE: 0.07 / math.sqrt(3)}
 """Radii of circle and bowl, and circumradius of the triangle with sides of 7 cm."""
@@ -198,6 +210,11 @@ NEEDED: Mapping[str, Callable[[Rng], _Placed]] = {
     TO_WHITE: partial(_pick, target=WHITE),
     BESIDE_BOWL: partial(_pick, target=BOWL),
     BESIDE_TRIANGLE: partial(_pick, target=TRIANGLE),
+    BESIDE_BOOK: partial(_pick, target=BOOK),
+    BESIDE_WHITE: partial(_pick, target=WHITE),
+    TO_TRIANGLE: partial(_pick, target=TRIANGLE),
+    TO_BOWL: partial(_pick, target=BOWL),
+    LIFT: partial(_pick, target=CIRCLE),
     PUSH: partial(_pair, near=0.12, far=0.24),
     PUSH_TO_BOWL: partial(_push_to, target=BOWL, near=0.14, far=0.26),
     PUSH_TO_WHITE: partial(_push_to, target=WHITE, near=0.17, far=0.28),

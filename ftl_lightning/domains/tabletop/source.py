@@ -125,6 +125,8 @@ def perform(
             ended, success = len(actions), done
         if ended is not None and len(actions) >= ended + (PAST if success and task in PUSHES else 0):
             break
+    if ended is None:  # a task without an event that ends it
+        success = judged(task, env.scene, info)
     places = None
     if scatter:
         pictures, places = scattered(env, task, info["trace"], rng)
