@@ -479,7 +479,7 @@ def fit(recogniser: Recogniser, states: Tensor, label: Tensor, seed: int, steps:
     courses = recogniser.courses(states)
     for name, strength in (("summary", 1e-3), ("extremes", 2e-3)):
         recogniser.set_scale(name, NUMBERS[name](states, recogniser.joints), 0.02)
-        _fit_linear(recogniser.linear[name], recogniser.numbers(name, states), label, strength)
+        _fit_linear(recogniser.linear[name], recogniser.numbers(states)[name], label, strength)
 
     def loss(logits: Tensor, rows: Tensor) -> Tensor:
         return functional.cross_entropy(logits, label[rows], label_smoothing=0.1)
@@ -562,7 +562,7 @@ def fit_verifiers(
     """
     states, label = torch.cat([whole[0], hard[0]]), torch.cat([whole[1], hard[1]])
     recogniser.set_scale("turns", VERIFIED_BY["turns"](states, recogniser.joints), 0.02)
-    numbers = torch.cat([recogniser.all_numbers(some) for some in states.split(2000)])
+    numbers = torch.cat([torch.cat(list(recogniser.numbers(some).values()), dim=1) for some in states.split(2000)])
     shown = torch.cat([torch.ones(len(whole[1])), torch.zeros(len(hard[1]))])
 
     def loss(logits: Tensor, rows: Tensor) -> Tensor:

@@ -109,39 +109,37 @@ class Recogniser(nn.Module):
         """Network inputs of windows ``(sample, 32, 42)``."""
         return self._scaled("signals", signals(states, self.joints))
 
-    def numbers(self, name: str, states: Tensor) -> Tensor:
-        """Scaled features of :data:`VERIFIED_BY`."""
-        return self._scaled(name, VERIFIED_BY[name](states, self.joints))
+    def numbers(self, states: Tensor) -> dict[str, Tensor]:
+        """Scaled features of windows ``(sample, 32, 42)`` for linear classifiers, and for verifiers if there are any."""
+        measures = VERIFIED_BY if len(self.verifiers) else NUMBERS
+        return {name: self._scaled(name, of(states, self.joints)) for name, of in measures.items()}
 
     def features(self, states: Tensor) -> Tensor:
         """Embedding of the first network ``(sample, EMBEDDING)``, with about unit variance over the training windows."""
         return self._scaled("embedding", cast(Network, self.networks[0]).embedding(self.courses(states)))
 
-    def votes(self, states: Tensor) -> dict[str, Tensor]:
-        """Log probabilities ``(sample, class)`` of the networks, and of each linear classifier."""
-        courses = self.courses(states)
+    def votes(self, states: Tensor, numbers: Mapping[str, Tensor] | None = None) -> dict[str, Tensor]:
+        """Log probabilities ``(sample, class)`` of the networks, and of each linear classifier, with their features."""
+        courses, numbers = self.courses(states), self.numbers(states) if numbers is None else numbers
         networks = torch.stack([network(courses).log_softmax(dim=-1) for network in self.networks]).mean(dim=0)
-        linear = {name: layer(self.numbers(name, states)).log_softmax(dim=-1) for name, layer in self.linear.items()}
+        linear = {name: layer(numbers[name]).log_softmax(dim=-1) for name, layer in self.linear.items()}
         return {"networks": networks, **linear}
 
     def forward(self, states: Tensor) -> Tensor:
         """Mean log probabilities ``(sample, class)``; -inf for actions without motion, or that verifiers reject."""
-        scores = torch.stack(list(self.votes(states).values())).mean(dim=0)
+        numbers = self.numbers(states)
+        scores = torch.stack(list(self.votes(states, numbers).values())).mean(dim=0)
         actions_only = torch.tensor([name not in RESTING for name in self.classes])
         excluded = self._still(states)[:, None]
         if len(self.verifiers):
             thresholds = torch.tensor([VERIFIED.get(name, -torch.inf) for name in self.classes])
-            excluded = excluded | (self.verified(states) < thresholds)
+            excluded = excluded | (self.verified(numbers) < thresholds)
         return scores.masked_fill(excluded & actions_only, -torch.inf)
 
-    def verified(self, states: Tensor) -> Tensor:
+    def verified(self, numbers: Mapping[str, Tensor]) -> Tensor:
         """Mean logits ``(sample, class)`` that a window shows a whole action; meaningful for :data:`VERIFIED` alone."""
-        numbers = self.all_numbers(states)
-        return torch.stack([verifier(numbers) for verifier in self.verifiers]).mean(dim=0)
-
-    def all_numbers(self, states: Tensor) -> Tensor:
-        """Verifier inputs ``(sample, number)`` of windows ``(sample, 32, 42)``."""
-        return torch.cat([self.numbers(name, states) for name in VERIFIED_BY], dim=1)
+        every = torch.cat(list(numbers.values()), dim=1)
+        return torch.stack([verifier(every) for verifier in self.verifiers]).mean(dim=0)
 
     def _still(self, states: Tensor) -> Tensor:
         """Whether no joint moves far within a sixth of a second: ``(sample,)``. Trembling joints are still."""
