@@ -46,9 +46,9 @@ def mirrored_text(text: str) -> str:
     return re.sub(r"\b(left|right)\b", lambda side: _SIDES[side[0]], text)
 
 
-def _alone(concepts: tuple[str, ...]) -> tuple[EvaluationTask, ...]:
+def _alone(concepts: tuple[str, ...], setting: str = "new concept") -> tuple[EvaluationTask, ...]:
     """New concepts from new poses."""
-    return tuple(EvaluationTask("new concept", text, (text,)) for text in concepts)
+    return tuple(EvaluationTask(setting, text, (text,)) for text in concepts)
 
 
 def _new(concepts: tuple[str, ...]) -> tuple[EvaluationTask, ...]:
@@ -85,7 +85,7 @@ SUITES = {
     "whole": Suite(_composed(TEST_CONCEPTS)),
     "database": Suite(_new(DATABASE_CONCEPTS)),
     "validation": Suite(_new(VALIDATION_CONCEPTS)),
-    "more": Suite(_alone((*TEST_CONCEPTS, *VALIDATION_CONCEPTS, *MORE_CONCEPTS))),
+    "more": Suite(_alone((*TEST_CONCEPTS, *VALIDATION_CONCEPTS, *MORE_CONCEPTS), "new concept, eight actions")),
 }
 """``paper`` and ``protocol``, with the initial states of the paper, are for final evaluation; ``validation`` is for tuning.
 ``more`` has every action that pretraining does not show, those of ``validation`` among them. ``database`` needs

@@ -110,7 +110,7 @@ WIDE_SUITES = {
     "paper": SUITES["paper"],
     "pairs": Suite((EvaluationTask("new concept", PUSH_TO_BOOK, (PUSH_TO_BOOK,)),)),
     "validation": SUITES["validation"],
-    "more": Suite(tuple(EvaluationTask("new concept", task, (task,)) for task in (*PAIRS, PUSH_ON_BOOK, LIFT))),
+    "more": Suite(tuple(EvaluationTask("new concept, eight tasks", task, (task,)) for task in (*PAIRS, PUSH_ON_BOOK, LIFT))),
 }
 """``pairs``: a verb and an object that pretraining shows separately; ``more``: all :data:`PAIRS`, a lift and the paper's task."""
 
