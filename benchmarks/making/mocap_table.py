@@ -17,13 +17,13 @@ JACKS, CIRCLE = "jumping jacks", "arm circle"
 BOTH = tuple(f"{concept} + {other}" for concept in (JACKS, CIRCLE) for other in ("walk", "jump"))
 NEW, PARTS, WHOLE = "new concept", "new + training, by parts of the body", "new + training"
 LAST, LAST_BOTH = "new concept, last states", "new + training, last states"
+MORE = "new concept, eight actions"
 METHODS = (
     ("**over time with modes**", "FTL-IGM", "with modes over time", 1),
     ("**the same with an adapter**", "FTL-IGM", "with modes over time with adapter", 1),
     ("form chosen", "FTL-IGM", "over time form chosen", 1),
     ("over time, one set", "FTL-IGM", "over time", 1),
     ("one set for the whole plan, K = 2", "FTL-IGM", "", 2),
-    ("the same with modes", "FTL-IGM", "with modes", 2),
     ("LoRA fine-tuning", "LoRA fine-tuning", "", 1),
     ("language", "language", "", 0),
     ("BC", "BC", "", 1),
@@ -90,6 +90,22 @@ def compositions(rows: pd.DataFrame) -> str:
     return table(head, list(zip(*columns, strict=True)))
 
 
+def more(rows: pd.DataFrame) -> str:
+    """Rule and judge of each of the eight actions, for every method."""
+    columns = {name: selected(rows, method, form, components) for name, method, form, components in METHODS}
+    columns = {name: own for name, own in columns.items() if (own["setting"] == MORE).any()}
+    actions = list(dict.fromkeys(rows.loc[rows["setting"] == MORE, "task"]))
+    lines = [[task, *(_rule_and_judge(own, task) for own in columns.values())] for task in actions]
+    mean = rows[(rows["setting"] == MORE) & (rows["metric"] == "rule")]
+    of_all = [f"{values_of.mean():.2f}" for own in columns.values() for values_of in [own.loc[own.index.isin(mean.index), "value"]]]
+    return table(["from three demonstrations: rule, judge", *columns], [*lines, ["mean of the rules", *of_all]])
+
+
+def _rule_and_judge(rows: pd.DataFrame, task: str) -> str:
+    judged = cell(values(rows, MORE, task, "accuracy"))
+    return f"{cell(values(rows, MORE, task, 'rule'))}, {'-' if 'nan' in judged else judged}"
+
+
 def protocol(rows: pd.DataFrame) -> str:
     """The paper's form of the concept from the demonstrations' last states."""
     own = rows[(rows["method"] == "FTL-IGM") & rows["setting"].isin((LAST, LAST_BOTH))]
@@ -124,12 +140,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
         ("rule", ("rule",), 2),
         ("level starts", ("level",), 2),
         ("strides", ("strides",), 2),
+        ("full turn", ("full turn",), 2),
         ("degrees turned", ("degrees turned",), 0),
         ("judge", ("accuracy",), 2),
         ("jerk", ("jerk",), 0),
     )
-    parts = [new_concepts(rows, JACKS, jacks), new_concepts(rows, CIRCLE, circle), compositions(rows), protocol(rows)]
-    write_text(chosen.out, "\n\n".join(parts) + "\n")
+    tables = [new_concepts(rows, JACKS, jacks), new_concepts(rows, CIRCLE, circle), more(rows), compositions(rows), protocol(rows)]
+    write_text(chosen.out, "\n\n".join(tables) + "\n")
 
 
 if __name__ == "__main__":

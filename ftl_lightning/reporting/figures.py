@@ -1,9 +1,12 @@
 """Figures from results."""
 
+import itertools
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence, Set
+from typing import NamedTuple
 
 import pandas as pd
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -40,9 +43,11 @@ SPARE = ("#117733", "#ddcc77", "#88ccee", "#555555")
 """Colours of user methods, used before colours of methods that a figure lacks."""
 COLOURS = (*dict.fromkeys(OF_METHODS.values()), *SPARE)  # colours in order, for lines that are not methods
 PAPER_COLOUR = "#9a9a9a"
-LINES = ("dotted", "dashed", "dashdot", (0, (1, 4)), (0, (6, 2, 1, 2, 1, 2)), "solid")  # line styles of reference policies
 REFERENCE_MARKS = {REPLAYED: "X", FRESH: "*"}  # markers of the references of novelty and coverage
-WIDEST = 60.0  # maximum width of a figure in inches; a figure of thousands of settings would fill the memory
+WIDTH, FONT = 4.4, 11.0  # inches, and points of all text: 12 pixels where a page shows a figure 358 pixels wide
+TALLEST = 120.0  # maximum height of a figure in inches; a figure of thousands of settings would fill the memory
+LABEL = 22  # maximum number of characters in a line of a bar's label
+LINE = 0.19  # height of a line of text in inches
 
 
 def colours(named: Iterable[tuple[str, Compared]]) -> dict[str, str]:
@@ -62,27 +67,51 @@ def colours(named: Iterable[tuple[str, Compared]]) -> dict[str, str]:
     return chosen
 
 
-def _bar_axes(bars: int, beside: float) -> tuple[Figure, Axes]:
-    """An empty figure for groups of bars, with ``beside`` inches for axis and legend."""
-    figure = Figure(figsize=(min(1.9 * max(bars, 2) + beside, WIDEST), 3.4), layout="constrained")
-    return figure, figure.subplots()
+class Bar(NamedTuple):
+    """A horizontal bar: label, mean, standard error, colour (``None`` for a reference), and the paper's number, if any."""
+
+    label: str
+    mean: float
+    error: float | None = None
+    colour: str | None = None
+    paper: float | None = None
 
 
-def _once(axes: Axes, label: str) -> str | None:
-    """The legend entry of a label at its first use, else ``None``."""
-    return None if figure_text(label) in axes.get_legend_handles_labels()[1] else figure_text(label)
+def _stacked(heights: Sequence[float], beside: float = 0.0) -> tuple[Figure, list[Axes]]:
+    """A figure of axes below each other with heights in inches, and ``beside`` inches for a legend."""
+    figure = Figure(figsize=(WIDTH, min(sum(heights) + beside, TALLEST)), layout="constrained")
+    panels = list(figure.subplots(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0])
+    for axes in panels:
+        axes.tick_params(labelsize=FONT)
+    return figure, panels
 
 
-def _policy_line(axes: Axes, index: int, policy: str, mean: float, start: float, end: float) -> None:
-    line = LINES[index % len(LINES)]
-    axes.hlines(mean, start, end, colors="black", linewidth=1, linestyles=line, label=_once(axes, policy))  # type: ignore[arg-type]
+def _title(axes: Axes, title: str, width: int = 2 * LABEL) -> None:
+    wrapped = textwrap.fill(figure_text(title), width, break_long_words=False)
+    axes.set_title(wrapped, fontsize=FONT, loc="left", fontweight="bold")
 
 
-def _label_bars(axes: Axes, places: Sequence[float], shown: Sequence[str], metric: str, title: str) -> None:
-    """Label axes with settings, wrapped so that neighbours do not touch, and draw the legend."""
-    axes.set_xticks(places, [textwrap.fill(figure_text(setting), 18, break_long_words=False) for setting in shown])
-    axes.set(ylim=(0, 1.05), ylabel=figure_text(metric), title=figure_text(title))
-    axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))
+def _bars(panels: Mapping[str, Sequence[Bar]]) -> Figure:
+    """Plot bars with their values; a panel for each title. Bars of references are empty, diamonds are the paper's numbers."""
+    labels = {title: [textwrap.fill(figure_text(bar.label), LABEL) for bar in bars] for title, bars in panels.items()}
+    lines = {title: [text.count("\n") + 1 for text in texts] for title, texts in labels.items()}
+    figure, axes_of = _stacked([LINE * (sum(counts) + 4.5) for counts in lines.values()])
+    for axes, (title, bars) in zip(axes_of, panels.items(), strict=True):
+        ends = list(itertools.accumulate(lines[title]))
+        places = [end - count / 2 for end, count in zip(ends, lines[title], strict=True)]
+        for place, bar in zip(places, bars, strict=True):
+            edge = {"color": bar.colour} if bar.colour else {"facecolor": "white", "edgecolor": "black"}
+            axes.barh(place, bar.mean, 0.8, xerr=bar.error, capsize=2, label=figure_text(bar.label), **edge)  # type: ignore[arg-type]
+            end = bar.mean + (bar.error or 0)
+            axes.annotate(f"{bar.mean:.2f}", (end, place), (4, 0), textcoords="offset points", va="center", fontsize=FONT)
+            if bar.paper is not None:
+                axes.plot(bar.paper, place, "D", color="black", markersize=5)
+        highest = max((max(bar.mean + (bar.error or 0), bar.paper or 0) for bar in bars), default=1.0)
+        axes.set_yticks(places, labels[title])
+        axes.set(xlim=(0, 1.2 * max(highest, 1.0)), ylim=(max(ends, default=1) + 0.2, -0.2))
+        axes.spines[["top", "right"]].set_visible(False)
+        _title(axes, title, LABEL + 4)
+    return figure
 
 
 def accuracy_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy") -> Figure:
@@ -91,27 +120,22 @@ def accuracy_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy
     """
     rows = labelled(latest(select(results, domain=domain.name, metric=metric)))
     ours, how = main_rows(rows, main_omega(domain))
-    shown, learned = settings(domain, ours), sorted(set(ours["label"]))
-    figure, axes = _bar_axes(len(shown), 3.5)
-    colour_of = colours(_labelled_methods(ours))
-    width = 0.8 / (len(learned) + 1)
-    references = select(rows, role=REFERENCE)
-    policies = sorted(set(references["label"]))
-    for place, setting in enumerate(shown):
-        if papers := lookup(domain, setting, metric):
-            label = _once(axes, "paper")
-            axes.bar(place, papers.value, width, yerr=papers.error, color=PAPER_COLOUR, capsize=2, label=label)
-        for index, name in enumerate(learned, start=1):
+    colour_of, references = colours(_labelled_methods(ours)), select(rows, role=REFERENCE)
+    panels = {}
+    for setting in settings(domain, ours):
+        papers = lookup(domain, setting, metric)
+        bars = [Bar("paper", papers.value, papers.error, PAPER_COLOUR)] if papers else []
+        for name, colour in colour_of.items():
             if number := summarise(select(ours, setting=setting, label=name)):
-                label, colour = _once(axes, name), colour_of[name]
-                axes.bar(place + index * width, number.mean, width, yerr=number.error, color=colour, capsize=2, label=label)
-        for index, policy in enumerate(policies):
-            if reference := summarise(select(references, setting=setting, label=policy)):
-                span = (place - width / 2, place + (len(learned) + 0.5) * width)
-                _policy_line(axes, index, policy, reference.mean, *span)
-    places = [place + width * len(learned) / 2 for place in range(len(shown))]
-    _label_bars(axes, places, shown, metric, f"{domain.name}, {how}" if how else domain.name)
-    return figure
+                bars.append(Bar(name, number.mean, number.error, colour))
+        panels[f"{domain.name}, {how}: {setting}" if how else f"{domain.name}: {setting}"] = bars + _references(references, setting)
+    return _bars(panels)
+
+
+def _references(rows: pd.DataFrame, setting: str) -> list[Bar]:
+    """Bars of the references of a setting, by name."""
+    means = select(rows, setting=setting).groupby("method")["value"].mean()
+    return [Bar(str(name), float(mean)) for name, mean in means.items()]
 
 
 def comparison_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy") -> Figure:
@@ -121,65 +145,52 @@ def comparison_bars(domain: Domain, results: pd.DataFrame, metric: str = "accura
     rows = compared(domain, results)
     names = methods(rows)
     rows = select(rows, metric=metric)
-    shown = settings(domain, rows)
     colour_of = colours((method_label(*method), method) for method in names)
-    width = 0.8 / len(names)
-    figure, axes = _bar_axes(len(shown), 3)
-    for index, method in enumerate(names):
-        method_rows, colour = of_method(rows, method), colour_of[method_label(*method)]
-        for place, setting in enumerate(shown):
-            where = place + (index - (len(names) - 1) / 2) * width
-            label = None if place else figure_text(method_label(*method))
-            if number := summarise(select(method_rows, setting=setting)):
-                axes.bar(where, number.mean, width, yerr=number.error, color=colour, capsize=2, label=label)
-            elif label and not method_rows.empty:
-                axes.bar(where, 0, width, color=colour, label=label)
-            if papers := lookup(domain, setting, metric, method=method):
-                axes.plot(where, papers.value, "D", color="black", markersize=4, label=_once(axes, "the paper's"))
     references = select(reference_lines(domain, results), metric=metric)
-    for index, policy in enumerate(sorted(set(references["method"]))):
-        policy_rows = select(references, method=policy)
-        for place, setting in enumerate(shown):
-            if setting in set(policy_rows["setting"]):
-                mean = select(policy_rows, setting=setting)["value"].mean()
-                _policy_line(axes, index, policy, mean, place - 0.45, place + 0.45)
-    _label_bars(axes, range(len(shown)), shown, metric, domain.name)
-    return figure
+    panels = {}
+    for setting in settings(domain, rows):
+        bars = []
+        for method in names:
+            papers, label = lookup(domain, setting, metric, method=method), method_label(*method)
+            if number := summarise(select(of_method(rows, method), setting=setting)):
+                bars.append(Bar(label, number.mean, number.error, colour_of[label], papers.value if papers else None))
+        panels[f"{setting}, {metric}" + (" (less is better)" if domain.less_is_better(metric) else "")] = bars + _references(
+            references, setting
+        )
+    return _bars(panels)
 
 
 MARKS = "os^Pv*X<h>p8d"  # markers of methods in the overview
-ROW = 0.5  # height of a line of the overview in inches
+ROW = 0.7  # height of a line of the overview in inches
 
 
 def overview_dots(results: pd.DataFrame) -> Figure:
-    """Plot all domains, settings and metrics of a comparison: a marker for each method, with standard errors over tasks. Open
+    """Plot the headline metric of all domains and settings: a marker for each method, with standard errors over tasks. Open
     diamonds are the paper's numbers of the same method; ticks are references. Our forms are limited to the paper's,
     automatically chosen forms and the default forms of the domains. Rows are those of
     :func:`~ftl_lightning.reporting.comparison.all_methods`.
     """
-    lines = shown_lines(results)
+    lines = [line for line in shown_lines(results) if line[2] == line[0].comparison.headline] or shown_lines(results)
     series = _series(methods(results), {domain.comparison.ours for domain, _, _ in lines})
     colour_of = colours((label, forms[0]) for label, forms in series.items())
     panels = {domain.name: [line for line in lines if line[0].name == domain.name] for domain, _, _ in lines}
-    sides: tuple[list[str], list[str]] = ([], [])
-    for name in panels:
-        min(sides, key=lambda side: sum(len(panels[shown]) + 1 for shown in side)).append(name)
-    most = max((sum(len(panels[name]) + 1 for name in side) for side in sides), default=1)
-    figure = Figure(figsize=(7.4, min(ROW * most + 0.9, WIDEST)), layout="constrained")
-    halves, legend = figure.subfigures(2, 1, squeeze=False, height_ratios=[ROW * most, 0.9])[:, 0]
-    for half, side in zip(halves.subfigures(1, 2, squeeze=False)[0], sides, strict=True):
-        if side:
-            spaces = [len(panels[name]) for name in side]
-            for axes, name in zip(half.subplots(len(side), 1, squeeze=False, height_ratios=spaces)[:, 0], side, strict=True):
-                _dots(axes, results, panels[name], series, colour_of)
+    entries = len(series) + 2
+    figure, axes_of = _stacked([ROW * len(shown) + 0.5 for shown in panels.values()] or [1.0], LINE * 1.3 * entries)
+    for axes, shown in zip(axes_of, panels.values(), strict=False):
+        _dots(axes, results, shown, series, colour_of)
     handles = {
-        label: Line2D([], [], color=colour_of[label], marker=MARKS[index % len(MARKS)], linestyle="", markersize=5)
+        label: Line2D([], [], color=colour_of[label], marker=MARKS[index % len(MARKS)], linestyle="", markersize=6)
         for index, label in enumerate(series)
     }
-    handles["the paper's"] = Line2D([], [], color="black", marker="D", markerfacecolor="none", linestyle="", markersize=5)
-    handles["references"] = Line2D([], [], color="black", marker="|", linestyle="", markersize=8)
-    legend.legend(list(handles.values()), list(map(figure_text, handles)), fontsize=8, loc="center", ncols=4, frameon=False)
+    handles["the paper's"] = Line2D([], [], color="black", marker="D", markerfacecolor="none", linestyle="", markersize=6)
+    handles["references"] = Line2D([], [], color="black", marker="|", linestyle="", markersize=9)
+    _legend(figure, handles)
     return figure
+
+
+def _legend(figure: Figure, handles: Mapping[str, Artist]) -> None:
+    """Draw a legend below a figure, an entry in a line."""
+    figure.legend(list(handles.values()), list(map(figure_text, handles)), fontsize=FONT, loc="outside lower left", frameon=False)
 
 
 def _series(measured: Sequence[Compared], defaults: Set[Compared]) -> dict[str, list[Compared]]:
@@ -204,9 +215,9 @@ def _dots(
     rows, references = compared(domain, results), reference_lines(domain, results)
     for place, (_, setting, metric) in enumerate(lines):
         title = f"{setting}, {metric}" + (" (less is better)" if domain.less_is_better(metric) else "")
-        axes.text(0, place - 0.34, figure_text(title), fontsize=7, va="center")
+        axes.text(0, place - 0.34, figure_text(title), fontsize=FONT, va="center")
         means = select(references, setting=setting, metric=metric).groupby("method")["value"].mean()
-        axes.plot(means, [place - 0.12] * len(means), "|", color="black", markersize=5, markeredgewidth=1)
+        axes.plot(means, [place - 0.12] * len(means), "|", color="black", markersize=6, markeredgewidth=1)
         for index, (label, forms) in enumerate(series.items()):
             height = place + 0.4 * index / max(len(series) - 1, 1)
             mark = {"color": colour_of[label], "markersize": 4}
@@ -221,9 +232,8 @@ def _dots(
             axes.axhline(place - 0.5, color=PAPER_COLOUR, linewidth=0.4)
     axes.set(ylim=(len(lines) - 0.5, -0.5), yticks=[])
     axes.set_xlim(-0.03, max(1.03, axes.get_xlim()[1]))
-    axes.tick_params(labelsize=7)
     axes.grid(axis="x", linewidth=0.3)
-    axes.set_title(figure_text(domain.name), fontsize=9, loc="left", fontweight="bold")
+    _title(axes, domain.name)
 
 
 def _labelled_methods(rows: pd.DataFrame) -> list[tuple[str, Compared]]:
@@ -234,8 +244,8 @@ def _labelled_methods(rows: pd.DataFrame) -> list[tuple[str, Compared]]:
 
 def growth(domain: Domain, results: pd.DataFrame) -> Figure:
     """Plot accuracy against the number of demonstrations and against K, with standard errors over tasks, from rows of curves."""
-    figure = Figure(figsize=(8, 3.2), layout="constrained")
-    for axes, axis in zip(figure.subplots(1, len(AXES), sharey=True), AXES, strict=True):
+    figure, panels = _stacked([2.6] * len(AXES), 0.5)
+    for axes, axis in zip(panels, AXES, strict=True):
         rows = points(domain, results, axis)
         for colour, setting in zip(COLOURS, dict.fromkeys(rows["setting"]), strict=False):
             setting_rows = select(rows, setting=setting)
@@ -243,14 +253,19 @@ def growth(domain: Domain, results: pd.DataFrame) -> Figure:
             numbers = [summarise(select(setting_rows, **{axis: count})) for count in counts]
             means = [number.mean for number in numbers if number]
             errors = [number.error or 0.0 for number in numbers if number]
-            axes.errorbar(counts, means, errors, marker="o", capsize=2, color=colour, label=figure_text(setting))
-        axes.set(xlabel=axis, ylim=(0, 1.05))
+            axes.errorbar(counts, means, errors, marker="o", capsize=2, color=colour, label=setting)
+        axes.set(ylim=(0, 1.05))
+        axes.set_xlabel(axis, fontsize=FONT)
+        axes.set_ylabel(figure_text(" ".join(set(rows["metric"]))), fontsize=FONT)
         axes.set_xticks(sorted(set(rows[axis])))
-        if axis == "demonstrations":
-            axes.set_ylabel(figure_text(" ".join(set(rows["metric"]))))
-            axes.legend(fontsize=8, loc="lower right")
-    figure.suptitle(figure_text(domain.name), fontsize=10)
+    _title(panels[0], domain.name)
+    _legend(figure, _handles(panels))
     return figure
+
+
+def _handles(panels: Sequence[Axes]) -> dict[str, Artist]:
+    """Legend entries of several axes by label, each once."""
+    return {name: handle for axes in panels for handle, name in zip(*axes.get_legend_handles_labels(), strict=True)}
 
 
 def frontier(domain: Domain, rows: pd.DataFrame) -> Figure:
@@ -262,41 +277,41 @@ def frontier(domain: Domain, rows: pd.DataFrame) -> Figure:
     rows = rows[rows["domain"] == domain.name].dropna(subset=["accuracy", "coverage"])
     rows = rows.assign(panel=rows["setting"] + (", " + rows["suite"] if len(set(rows["suite"])) > 1 else ""))
     shown = list(dict.fromkeys(rows["panel"]))
-    figure = Figure(figsize=(min(3.6 * max(len(shown), 1) + 2.2, WIDEST), 3.6), layout="constrained")
-    panels = figure.subplots(1, max(len(shown), 1), sharey=True, squeeze=False)[0]
     lines = labelled(rows[~rows["method"].isin(list(REFERENCE_MARKS))])
     colour_of = colours(_labelled_methods(lines))
+    figure, panels = _stacked([3.2] * max(len(shown), 1), LINE * 1.3 * (len(colour_of) + len(REFERENCE_MARKS)))
     for axes, panel in zip(panels, shown, strict=False):
         for label, colour in colour_of.items():
             by_temperature = select(lines, panel=panel, label=label).groupby("temperature", dropna=False)
             means = by_temperature[["coverage", "accuracy"]].mean().sort_index()
             if means.empty:
                 continue
-            axes.plot(means["coverage"], means["accuracy"], color=colour, linewidth=1, label=figure_text(label))
+            axes.plot(means["coverage"], means["accuracy"], color=colour, linewidth=1, label=label)
             strengths = [1 - 0.75 * place / len(means) for place in range(len(means))]
-            axes.scatter(means["coverage"], means["accuracy"], color=colour, alpha=strengths, s=22)
+            axes.scatter(means["coverage"], means["accuracy"], color=colour, alpha=strengths, s=22)  # type: ignore[arg-type]
         for method, mark in REFERENCE_MARKS.items():
             mean = select(rows, panel=panel, method=method)[["coverage", "accuracy"]].mean()
             if mean.notna().all():
                 axes.plot(mean["coverage"], mean["accuracy"], mark, color="black", markersize=8, label=method)
-        axes.set(xlabel="coverage (less is better)", ylim=(-0.05, 1.05), title=figure_text(panel))
-    panels[0].set_ylabel(figure_text(domain.main_metric))
-    handles = {name: handle for axes in panels for handle, name in zip(*axes.get_legend_handles_labels(), strict=True)}
-    figure.legend(list(handles.values()), list(handles), fontsize=8, loc="outside right upper")
+        axes.set(ylim=(-0.05, 1.05))
+        axes.set_ylabel(figure_text(domain.main_metric), fontsize=FONT)
+        _title(axes, panel)
     known = lines.loc[lines["method"] != NOISY, "temperature"].dropna()
-    temperatures = "none" if known.empty else f"{known.min():g} (dark) to {known.max():g}"
-    figure.suptitle(figure_text(f"{domain.name}: temperature from {temperatures}"), fontsize=10)
+    temperatures = "" if known.empty else f"\ntemperature {known.min():g} (dark) to {known.max():g} (light)"
+    panels[-1].set_xlabel(f"coverage (less is better){temperatures}", fontsize=FONT)
+    _legend(figure, _handles(panels))
     return figure
 
 
 def learning_time(curves: Mapping[str, Sequence[Measured]]) -> Figure:
     """Plot accuracy over seconds of learning, a line for each curve; the dotted line is the accuracy that all curves reach."""
-    figure = Figure(figsize=(6, 3.6), layout="constrained")
-    axes = figure.subplots()
+    figure, (axes,) = _stacked([3.4], LINE * 1.3 * len(curves))
     for colour, (name, curve) in zip(COLOURS, curves.items(), strict=False):
         seconds, accuracy = ([getattr(point, axis) for point in curve] for axis in ("seconds", "accuracy"))
-        axes.plot(seconds, accuracy, "o-", color=colour, markersize=4, label=figure_text(name))
+        axes.plot(seconds, accuracy, "o-", color=colour, markersize=4, label=name)
     axes.axhline(reached(curves), color=PAPER_COLOUR, linestyle="dotted")
-    axes.set(xscale="log", xlabel="seconds of learning", ylabel="accuracy", ylim=(-0.05, 1.05))
-    figure.legend(fontsize=8, loc="outside upper center", ncols=len(curves))
+    axes.set(xscale="log", ylim=(-0.05, 1.05))
+    axes.set_xlabel("seconds of learning", fontsize=FONT)
+    axes.set_ylabel("accuracy", fontsize=FONT)
+    _legend(figure, _handles([axes]))
     return figure

@@ -169,7 +169,7 @@ def test_the_frontier_is_a_line_of_means_in_the_order_of_temperatures_with_both_
     assert drawn[REPLAYED] == [[2.5, 1.0]]
     assert drawn[FRESH] == [[0.5, 1.0]]
     write_frontier(tmp_path / "frontier.json", [row("BC", None, 1.0, 3.0, suite="paper")])
-    titles = [axes.get_title() for axes in frontier(DOMAIN, read_frontier(tmp_path)).axes]
+    titles = [axes.get_title(loc="left") for axes in frontier(DOMAIN, read_frontier(tmp_path)).axes]
     assert titles == ["new concept, validation", "new concept, paper"]
 
 
