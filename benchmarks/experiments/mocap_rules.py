@@ -3,7 +3,8 @@
     python benchmarks/experiments/mocap_rules.py --root FOLDER --out results/mocap_rules.json
 
 Each threshold accepts 95 % of the windows of every person who shows the action. A window starts within four frames of a moment
-nearest to standing, as demonstrations do. ``--check true`` measures with the shipped thresholds and does not set them.
+nearest to standing, as demonstrations do. ``--check true`` measures with the shipped thresholds and does not set them. ``samples``
+are the shares of samples of committed concepts that satisfy each condition.
 """
 
 import argparse
@@ -20,11 +21,13 @@ from ftl_lightning.domains.mocap import measures
 from ftl_lightning.domains.mocap.measures import CONDITIONS, arm_rotation
 from ftl_lightning.domains.mocap.skeleton import HORIZON
 from ftl_lightning.domains.mocap.source import Recorded, at_rest
+from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.services.tensor_file import write_text
 
 QUANTILE = 0.05  # Share of each person's windows that a threshold refuses
 AROUND = 4  # Maximum frames between the start of a window and a moment nearest to standing
 STRIDE = 8  # Frames between windows of the training concepts' trials
+SAMPLES = 200  # Samples of each concept
 FILE = Path(measures.__file__).parent / "rules.json"
 Thresholds = Mapping[str, float]
 
@@ -57,11 +60,19 @@ def rate(action: str, limits: Thresholds, states: Tensor) -> float:
     return round(float(kept.float().mean()), 4)
 
 
+def of_samples(model: FewShot, source: Recorded, action: str, files: Sequence[Path]) -> dict[str, float]:
+    """Share of samples of concepts, from new initial poses, that satisfy each condition of an action's rule."""
+    starts = [source.starts(action, SAMPLES, seed) for seed in range(len(files))]
+    plans = [model.sample(model.load(file), observed=starts[seed], seed=seed).states for seed, file in enumerate(files)]
+    return {name: round(float(measures.holds(action, name, torch.cat(plans)).float().mean()), 4) for name in CONDITIONS[action]}
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """See the module."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--root", type=Path, required=True, help="folder of prepared recordings")
     parser.add_argument("--out", type=Path, default=Path("results/mocap_rules.json"))
+    parser.add_argument("--concepts", type=Path, default=Path("results/concepts/mocap"), help="a folder of concepts for each seed")
     parser.add_argument("--check", type=bool, default=False)
     chosen = parser.parse_args(arguments)
     source = Recorded(chosen.root)
@@ -81,6 +92,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             "holds, set by the others": {one: rate(action, thresholds(action, rest[one]), own[one]) for one in own if rest[one]},
             "training concepts": rate(action, limits[action], others),
         }
+        if files := sorted(chosen.concepts.glob(f"*/{action.replace(' ', '_')}.safetensors")):
+            found[action]["samples"] = of_samples(FewShot.from_pretrained("mocap"), source, action, files)
         if action == "arm circle":
             turned = {one: (arm_rotation(states) >= measures.FULL_TURN).all(dim=-1) for one, states in own.items()}
             found[action]["full turn"] = {one: round(float(full.float().mean()), 4) for one, full in turned.items()}
