@@ -16,7 +16,7 @@ author = "The ftl-lightning authors"
 copyright = "The ftl-lightning authors, MIT licence"
 release = version = __version__
 
-extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode", "sphinx_copybutton"]
 exclude_patterns = ["_build", "**/.ipynb_checkpoints"]
 nitpicky = False
 suppress_warnings = ["ref.python"]  # two classes may have attributes of the same name
@@ -41,6 +41,8 @@ toc_object_entries = False  # two thousand entries, which every page would build
 html_theme = "furo"
 html_title = f"ftl-lightning {__version__}"
 html_show_sourcelink = False
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
 
 
 # Links are written for readers of the repository. Pages below are links to files outside this folder, which Sphinx would not find.

@@ -80,6 +80,16 @@ def test_the_readmes_table_has_at_most_one_column_more() -> None:
     assert max(columns(README.read_text(encoding="utf-8"))) <= MOST_COLUMNS + 1
 
 
+def test_commands_wrap_and_have_a_button_that_copies_them() -> None:
+    page = SITE / "quick-start.html"
+    if not page.is_file():
+        pytest.skip("the documentation is not built: make docs")
+    text = page.read_text(encoding="utf-8")
+    assert "copybutton.js" in text
+    assert "site.css" in text
+    assert "pre-wrap" in (SITE / "_static" / "site.css").read_text(encoding="utf-8")
+
+
 @contextmanager
 def served(pages: list[str]) -> Iterator[str]:
     """The site on this machine alone, with a page that measures these."""
