@@ -171,7 +171,7 @@ SHORT = {
 """Options that make the README's commands a matter of seconds. ``play`` serves until it is stopped."""
 FEWER = {
     "count=10": "count=1",
-    'name="go to red bowl", progress=True)': 'name="go to red bowl", steps=2, form="paper")',
+    'form="paper", progress=True)': 'steps=2, form="paper")',
     "observed=starts)": 'observed=starts, sampler="ddim", steps=2)',
     'starts, goal="go to red bowl")': 'starts, goal="go to red bowl", replan=32, sampler="ddim", steps=2)',
 }
