@@ -80,6 +80,13 @@ def test_the_readmes_table_has_at_most_one_column_more() -> None:
     assert max(columns(README.read_text(encoding="utf-8"))) <= MOST_COLUMNS + 1
 
 
+@pytest.mark.parametrize("sheet", sorted((ROOT / "ftl_lightning").glob("*/**/*.css")), ids=lambda path: path.name)
+def test_text_of_pages_has_at_least_twelve_pixels(sheet: Path) -> None:
+    sizes = [float(size) for size in re.findall(r"font-size: ([\d.]+)rem", sheet.read_text(encoding="utf-8"))]
+    assert sizes
+    assert min(sizes) * 16 >= 12
+
+
 def test_commands_wrap_and_have_a_button_that_copies_them() -> None:
     page = SITE / "quick-start.html"
     if not page.is_file():
