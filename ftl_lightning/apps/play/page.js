@@ -136,6 +136,7 @@ async function start() {
   find("loading").hidden = true;
   find("end").hidden = Boolean(answers);
   paint();
+  if (!answers && state && !state.viewer) playExample();
   document.body.dataset.ready = Math.round(performance.now()); // milliseconds until the first state is drawn
 }
 

@@ -28,7 +28,10 @@ from ftl_lightning.services.text import filled
 from ftl_lightning.training.model_folder import find_model
 
 HERE = Path(__file__).parent
-SCRIPTS = (FILM, *(HERE / f"{name}.js" for name in ("space", "films", "ask", "record", "learn", "mix", "viewer", "page")))
+SCRIPTS = (
+    FILM,
+    *(HERE / f"{name}.js" for name in ("space", "films", "ask", "record", "example", "learn", "mix", "viewer", "page")),
+)
 """Scripts of the page in order; ``page`` starts the program."""
 POLICY = (
     "default-src 'none'; script-src 'nonce-{nonce}'; style-src 'nonce-{nonce}'; img-src data:; base-uri 'none'; form-action 'none'"
@@ -52,6 +55,7 @@ def page(nonce: str, offline: bytes | None = None) -> str:
         "STYLE": (HERE / "page.css").read_text(encoding="utf-8"),
         "SCRIPT": "\n".join(path.read_text(encoding="utf-8") for path in SCRIPTS),
         "NONCE": nonce,
+        "EXAMPLE": (HERE / "example.json").read_text(encoding="utf-8") if offline is None else "",
         "CSP": "" if offline is None else meta,
         "OFFLINE": "" if offline is None else base64.b64encode(offline).decode(),
     }

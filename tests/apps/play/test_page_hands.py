@@ -51,6 +51,25 @@ def learned(page: Browser) -> None:
     page.until(lambda: page.js("justLearned()"))
 
 
+def test_an_example_draws_itself_and_ends_when_somebody_draws(strokes: Browser) -> None:
+    cleared(strokes)
+    picture = "document.getElementById('show').toDataURL()"
+    strokes.until(lambda: strokes.text("next") == "Stroke 1 of 5")
+    empty = strokes.js(picture)
+    strokes.js("(playExample(), 1)")
+    strokes.until(lambda: strokes.text("next") == "Five strokes")
+    assert strokes.js(picture) != empty
+    strokes.until(lambda: strokes.text("next") == "Learned: samples")
+    stroke(strokes)
+    assert strokes.text("next") == "Stroke 2 of 5"
+    strokes.js("(playExample(), 1)")
+    assert strokes.text("next") == "Stroke 2 of 5", "no example once there is a demonstration"
+    cleared(strokes)
+    strokes.js("(playExample(), 1)")
+    strokes.until(lambda: strokes.text("next") == "Stroke 1 of 5")
+    assert strokes.js(picture) == empty
+
+
 def test_the_first_stroke_moves_nothing(strokes: Browser) -> None:
     cleared(strokes)
     where = "[find('ways').offsetTop, find('mix-title').offsetTop, document.querySelector('#slots li').offsetHeight]"
