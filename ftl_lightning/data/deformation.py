@@ -16,6 +16,23 @@ ROUNDS = 20
 _LEAST = 1e-12
 
 
+COMMON = 0.1
+"""Minimum mean square of the motion of a common path, relative to that of deviations from it. Scribbles have .03, kinds of strokes,
+pens, beats and other recorded behaviour .3 to 20."""
+
+
+def share_a_path(paths: Tensor) -> bool:
+    """Whether paths ``(example, horizon, state)`` of a concept vary about a common path, apart from their place.
+
+    The mean of scribbles is nearly a point: its deformations would be many times as large as any path. Single states count as
+    sharing a path.
+    """
+    mean = paths.mean(dim=0)
+    apart = paths - mean
+    moves, deviates = mean - mean.mean(dim=0), apart - apart.mean(dim=1, keepdim=True)
+    return bool(moves.square().mean() >= COMMON * deviates.square().mean())
+
+
 @dataclass(frozen=True, eq=False)
 class Deformations:
     """Deviations of examples from the mean of their concept, as deformations of this mean.

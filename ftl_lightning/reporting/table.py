@@ -224,7 +224,8 @@ def lookup(
 
 def headlines(domain: Domain, rows: pd.DataFrame) -> list[tuple[str, str]]:
     """Settings and metrics of short tables: those with numbers of the paper, the headline, and that of the suite ``more``, closed
-    loop first. Without a paper: the first setting of the suite ``paper``, else all settings, each with its decisive metric.
+    loop first. Without a paper: the first setting of the suite ``paper`` and that of ``more``, else all settings, each with its
+    decisive metric.
     """
     measured = set(zip(rows["setting"], rows["metric"], strict=True))
     measured_settings = settings(domain, rows)
@@ -234,8 +235,10 @@ def headlines(domain: Domain, rows: pd.DataFrame) -> list[tuple[str, str]]:
         if not number.task and (number.method != OURS or (number.components, number.omega) == (2, papers_omega(domain)))
     }
     if not numbers:
-        papers = [setting for setting in measured_settings if setting in _suite(domain, PAPER)][:1] or measured_settings
-        alone = [(setting, decisive(domain, rows[rows["setting"] == setting])) for setting in papers]
+        papers = [setting for setting in measured_settings if setting in _suite(domain, PAPER)][:1]
+        more = [setting for setting in measured_settings if setting in _suite(domain, MORE)]
+        shown = [*papers, *more] or measured_settings
+        alone = [(setting, decisive(domain, rows[rows["setting"] == setting])) for setting in shown]
         return [headline for headline in alone if headline in measured]
     reported = [(setting, metric) for setting in measured_settings for metric in metrics(domain) if (setting, metric) in numbers]
     executed = [(setting, domain.comparison.headline) for setting in dict.fromkeys(setting for setting, _ in reported)]

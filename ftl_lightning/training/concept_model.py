@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from ftl_lightning.data.actions import PRESENT
-from ftl_lightning.data.deformation import Deformations
+from ftl_lightning.data.deformation import Deformations, share_a_path
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import PINNED, READ, Feature, Observed, check_features, moved
 from ftl_lightning.data.places import Places, feature_of, first_windows, frames_of, shift, starts
@@ -320,6 +320,8 @@ class ConceptModel(Shown, nn.Module, ABC):
         frames = None if self.frames is None else self.frames[rows]
         plans = self.encode(first_windows(self.examples, self.horizon).to(self.device), observed, frames)
         several = [plans[some] for some in (rows == number for number in range(len(names))) if some.sum() > 1]
+        if self.frames is None:
+            several = [paths for paths in several if share_a_path(paths)]
         return Deformations.fit(several, deform=self.frames is None) if several else None
 
     def varied(self, plans: Tensor, parts: Sequence[Composition], generators: Sequence[torch.Generator]) -> Tensor:

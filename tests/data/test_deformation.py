@@ -2,7 +2,7 @@
 
 import torch
 
-from ftl_lightning.data.deformation import Deformations
+from ftl_lightning.data.deformation import Deformations, share_a_path
 
 TIME = torch.linspace(0, 1, 40)
 CIRCLE = torch.stack((torch.cos(6 * TIME), torch.sin(6 * TIME)), dim=1)
@@ -58,3 +58,14 @@ def test_where_paths_follow_places_deviations_are_added_as_they_are() -> None:
     found = Deformations.fit([paths], deform=False)
     added = found.of(LINE.expand(4, -1, -1), torch.arange(4))
     torch.testing.assert_close(added, (paths - paths.mean(dim=0)) * (4 / 3) ** 0.5)
+
+
+def test_scribbles_share_no_path_but_circles_lines_and_single_states_do() -> None:
+    draw = torch.Generator().manual_seed(0)
+    scribbles = torch.randn(200, 40, 2, generator=draw).cumsum(dim=1)
+    assert not share_a_path(scribbles)
+    assert share_a_path(circles(6))
+    assert share_a_path(LINE + 0.1 * torch.randn(6, 40, 2, generator=draw))
+    assert share_a_path(torch.randn(6, 1, 3, generator=draw))
+    huge = Deformations.fit([scribbles]).of(CIRCLE.expand(200, -1, -1), torch.arange(200))
+    assert float(huge.abs().amax(dim=(1, 2)).max()) > 5 * float(scribbles.std()), "what such a concept would add to a circle"
