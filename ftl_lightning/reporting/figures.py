@@ -45,7 +45,7 @@ COLOURS = (*dict.fromkeys(OF_METHODS.values()), *SPARE)  # colours in order, for
 PAPER_COLOUR = "#9a9a9a"
 REFERENCE_MARKS = {REPLAYED: "X", FRESH: "*"}  # markers of the references of novelty and coverage
 WIDTH, FONT = 4.4, 11.0  # inches, and points of all text: 12 pixels where a page shows a figure 358 pixels wide
-TALLEST = 120.0  # maximum height of a figure in inches; a figure of thousands of settings would fill the memory
+TALLEST = 60.0  # maximum height of a figure in inches; a figure of thousands of settings would fill the memory
 LABEL = 22  # maximum number of characters in a line of a bar's label
 LINE = 0.19  # height of a line of text in inches
 
