@@ -236,8 +236,8 @@ def headlines(domain: Domain, rows: pd.DataFrame) -> list[tuple[str, str]]:
     }
     if not numbers:
         papers = [setting for setting in measured_settings if setting in _suite(domain, PAPER)][:1]
-        more = [setting for setting in measured_settings if setting in _suite(domain, MORE)]
-        shown = [*papers, *more] or measured_settings
+        papers += [setting for setting in measured_settings if setting in _suite(domain, MORE)]
+        shown = papers or measured_settings
         alone = [(setting, decisive(domain, rows[rows["setting"] == setting])) for setting in shown]
         return [headline for headline in alone if headline in measured]
     reported = [(setting, metric) for setting in measured_settings for metric in metrics(domain) if (setting, metric) in numbers]
