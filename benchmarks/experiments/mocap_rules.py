@@ -3,8 +3,7 @@
     python benchmarks/experiments/mocap_rules.py --root FOLDER --out results/mocap_rules.json
 
 Each threshold accepts 95 % of the windows of every person who shows the action. A window starts within four frames of a moment
-nearest to standing, as demonstrations do. ``--check true`` measures with the shipped thresholds and does not set them. ``samples``
-are the shares of samples of committed concepts that satisfy each condition.
+nearest to standing, as demonstrations do. ``samples`` are the shares of samples of committed concepts that satisfy each condition.
 """
 
 import argparse
@@ -34,13 +33,13 @@ Thresholds = Mapping[str, float]
 
 def shown(source: Recorded, action: str, around: int | None = AROUND) -> dict[str, Tensor]:
     """Windows ``(window, 32, 42)`` of an action by person; ``None`` for windows that start at any frame."""
-    found = dict[str, list[Tensor]]()
+    by_person = dict[str, list[Tensor]]()
     for subject, states in stretches(source, action):
         rest = at_rest(states)
         starts = range(len(states) - HORIZON + 1)
         chosen = [start for start in starts if around is None or any(abs(start - frame) <= around for frame in rest)]
-        found.setdefault(subject, []).extend(states[start : start + HORIZON] for start in chosen)
-    return {subject: torch.stack(own) for subject, own in found.items()}
+        by_person.setdefault(subject, []).extend(states[start : start + HORIZON] for start in chosen)
+    return {subject: torch.stack(some) for subject, some in by_person.items()}
 
 
 def thresholds(action: str, people: Sequence[Tensor]) -> dict[str, float]:
@@ -54,10 +53,7 @@ def thresholds(action: str, people: Sequence[Tensor]) -> dict[str, float]:
 
 def rate(action: str, limits: Thresholds, states: Tensor) -> float:
     """Share of windows that satisfy an action's rule with these thresholds."""
-    kept = measures.jerk("", states, None) < measures.TREMBLING
-    for name, (measure, least) in CONDITIONS[action].items():
-        kept &= measure(states) >= limits[name] if least else measure(states) <= limits[name]
-    return round(float(kept.float().mean()), 4)
+    return round(float(measures.satisfied(action, states, limits).float().mean()), 4)
 
 
 def of_samples(model: FewShot, source: Recorded, action: str, files: Sequence[Path]) -> dict[str, float]:
@@ -73,33 +69,32 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--root", type=Path, required=True, help="folder of prepared recordings")
     parser.add_argument("--out", type=Path, default=Path("results/mocap_rules.json"))
     parser.add_argument("--concepts", type=Path, default=Path("results/concepts/mocap"), help="a folder of concepts for each seed")
-    parser.add_argument("--check", type=bool, default=False)
     chosen = parser.parse_args(arguments)
     source = Recorded(chosen.root)
     training = source.split("train", 0, 0)
     half = range(len(training) // 2)  # the others are mirror images
     others = torch.stack([one for row in half for one in windows(training.states[row, : int(training.lengths[row])], STRIDE)])
-    limits, found = {}, {}
+    limits, results = {}, {}
     for action in CONDITIONS:
-        own = shown(source, action)
-        limits[action] = measures.THRESHOLDS[action] if chosen.check else thresholds(action, [*own.values()])
-        anywhere = shown(source, action, None)
-        rest = {one: [states for other, states in own.items() if other != one] for one in own}
-        found[action] = {
-            "windows": {one: len(states) for one, states in own.items()},
-            "holds": {one: rate(action, limits[action], states) for one, states in own.items()},
+        people, anywhere = shown(source, action), shown(source, action, None)
+        limits[action] = thresholds(action, [*people.values()])
+        rest = {one: [states for other, states in people.items() if other != one] for one in people}
+        results[action] = {
+            "windows": {one: len(states) for one, states in people.items()},
+            "holds": {one: rate(action, limits[action], states) for one, states in people.items()},
             "holds at any phase": {one: rate(action, limits[action], states) for one, states in anywhere.items()},
-            "holds, set by the others": {one: rate(action, thresholds(action, rest[one]), own[one]) for one in own if rest[one]},
+            "holds, set by the others": {
+                one: rate(action, thresholds(action, rest[one]), people[one]) for one in people if rest[one]
+            },
             "training concepts": rate(action, limits[action], others),
         }
         if files := sorted(chosen.concepts.glob(f"*/{action.replace(' ', '_')}.safetensors")):
-            found[action]["samples"] = of_samples(FewShot.from_pretrained("mocap"), source, action, files)
+            results[action]["samples"] = of_samples(FewShot.from_pretrained("mocap"), source, action, files)
         if action == "arm circle":
-            turned = {one: (arm_rotation(states) >= measures.FULL_TURN).all(dim=-1) for one, states in own.items()}
-            found[action]["full turn"] = {one: round(float(full.float().mean()), 4) for one, full in turned.items()}
-    if not chosen.check:
-        write_text(FILE, json.dumps(limits, indent=1) + "\n")
-    text = json.dumps({"windows of training concepts": len(others), **found}, indent=1) + "\n"
+            turned = {one: (arm_rotation(states) >= measures.FULL_TURN).all(dim=-1) for one, states in people.items()}
+            results[action]["full turn"] = {one: round(float(full.float().mean()), 4) for one, full in turned.items()}
+    write_text(FILE, json.dumps(limits, indent=1) + "\n")
+    text = json.dumps({"windows of training concepts": len(others), **results}, indent=1) + "\n"
     print(text)
     write_text(chosen.out, text)
 

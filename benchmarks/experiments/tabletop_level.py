@@ -37,23 +37,22 @@ def main() -> None:
     chosen = parser.parse_args()
     models = {name: FewShot.from_pretrained(chosen.pretrained, settings=config) for name, config in FORMS.items()}
     model = models["learned"]
-    found: dict[str, object] = {"model": model.model.hash, "scenes": chosen.scenes, "seeds": chosen.seeds}
+    results: dict[str, object] = {"model": model.model.hash, "scenes": chosen.scenes, "seeds": chosen.seeds}
     with bar("table-top, level", len(chosen.seeds) * (1 + len(models)) + len(TRAINING_CONCEPTS), lines=True) as advance:
         for seed in chosen.seeds:
-            results = {"training text": rates(model, model[PUSH], PUSH_ON_BOOK, chosen.scenes, seed)}
+            measured = {"training text": rates(model, model[PUSH], PUSH_ON_BOOK, chosen.scenes, seed)}
             advance()
             for name, form in models.items():
                 demonstrations = form.domain.source(None).draw(PUSH_ON_BOOK, DEMONSTRATIONS, seed)
                 concept = form.learn(demonstrations, name=PUSH_ON_BOOK, seed=seed)
-                results[name] = rates(form, concept, PUSH_ON_BOOK, chosen.scenes, seed)
+                measured[name] = rates(form, concept, PUSH_ON_BOOK, chosen.scenes, seed)
                 advance()
-            found[f"seed {seed}"] = results
-            write_text(chosen.out, json.dumps(found, indent=1) + "\n")
-        found["training concepts"] = {}
+            results[f"seed {seed}"] = measured
+        trained = {}
         for task in TRAINING_CONCEPTS:
-            found["training concepts"] |= {task: rates(model, model[task], task, chosen.scenes, 0)}  # type: ignore[operator]
+            trained[task] = rates(model, model[task], task, chosen.scenes, 0)
             advance()
-    text = json.dumps(found, indent=1) + "\n"
+    text = json.dumps(results | {"training concepts": trained}, indent=1) + "\n"
     print(text)
     write_text(chosen.out, text)
 

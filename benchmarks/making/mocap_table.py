@@ -92,13 +92,12 @@ def compositions(rows: pd.DataFrame) -> str:
 
 def more(rows: pd.DataFrame) -> str:
     """Rule and judge of each of the eight actions, for every method."""
+    rows = rows[rows["setting"] == MORE]
     columns = {name: selected(rows, method, form, components) for name, method, form, components in METHODS}
-    columns = {name: own for name, own in columns.items() if (own["setting"] == MORE).any()}
-    actions = list(dict.fromkeys(rows.loc[rows["setting"] == MORE, "task"]))
-    lines = [[task, *(_rule_and_judge(own, task) for own in columns.values())] for task in actions]
-    mean = rows[(rows["setting"] == MORE) & (rows["metric"] == "rule")]
-    of_all = [f"{values_of.mean():.2f}" for own in columns.values() for values_of in [own.loc[own.index.isin(mean.index), "value"]]]
-    return table(["from three demonstrations: rule, judge", *columns], [*lines, ["mean of the rules", *of_all]])
+    columns = {name: some for name, some in columns.items() if not some.empty}
+    lines = [[task, *(_rule_and_judge(some, task) for some in columns.values())] for task in dict.fromkeys(rows["task"])]
+    means = [f"{some.loc[some['metric'] == 'rule', 'value'].mean():.2f}" for some in columns.values()]
+    return table(["from three demonstrations: rule, judge", *columns], [*lines, ["mean of the rules", *means]])
 
 
 def _rule_and_judge(rows: pd.DataFrame, task: str) -> str:

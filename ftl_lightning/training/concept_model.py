@@ -320,9 +320,9 @@ class ConceptModel(Shown, nn.Module, ABC):
         frames = None if self.frames is None else self.frames[rows]
         plans = self.encode(first_windows(self.examples, self.horizon).to(self.device), observed, frames)
         several = [plans[some] for some in (rows == number for number in range(len(names))) if some.sum() > 1]
-        if self.frames is None:
-            several = [paths for paths in several if share_a_path(paths)]
-        return Deformations.fit(several, deform=self.frames is None) if several else None
+        deform = self.frames is None  # else paths follow places
+        several = [paths for paths in several if share_a_path(paths)] if deform else several
+        return Deformations.fit(several, deform) if several else None
 
     def varied(self, plans: Tensor, parts: Sequence[Composition], generators: Sequence[torch.Generator]) -> Tensor:
         """Add the variation of the compositions to normalised plans ``(composition * count, horizon, state)``."""

@@ -240,17 +240,20 @@ THRESHOLDS: Mapping[str, Mapping[str, float]] = json.loads((Path(__file__).paren
 """Thresholds of :data:`CONDITIONS`, set from recordings alone by ``benchmarks/experiments/mocap_rules.py``, before any sample."""
 
 
-def holds(action: str, name: str, states: Tensor) -> Tensor:
-    """Whether a condition of an action's rule holds in windows ``(sample, frame, 42)``: ``(sample,)`` of bool."""
+def holds(action: str, name: str, states: Tensor, thresholds: Mapping[str, float] | None = None) -> Tensor:
+    """Whether a condition of an action's rule holds in windows ``(sample, frame, 42)``: ``(sample,)`` of bool.
+
+    ``thresholds`` by condition replace those of :data:`THRESHOLDS`.
+    """
     measure, least = CONDITIONS[action][name]
-    values, threshold = measure(states), THRESHOLDS[action][name]
+    values, threshold = measure(states), (thresholds or THRESHOLDS[action])[name]
     return values >= threshold if least else values <= threshold
 
 
-def satisfied(action: str, states: Tensor) -> Tensor:
+def satisfied(action: str, states: Tensor, thresholds: Mapping[str, float] | None = None) -> Tensor:
     """Whether windows ``(sample, frame, 42)`` satisfy an action's rule without trembling: ``(sample,)`` of bool."""
     calm = jerk("", states, None) < TREMBLING  # trembling joints would pass through any pose
-    return torch.stack([holds(action, name, states) for name in CONDITIONS[action]]).all(dim=0) & calm
+    return torch.stack([holds(action, name, states, thresholds) for name in CONDITIONS[action]]).all(dim=0) & calm
 
 
 _RIGID = [skeleton.BONES.index(bone) for bone in skeleton.RIGID]
