@@ -326,7 +326,7 @@ NARROW, LEAST = 358, 12  # pixels of a figure's width on a phone, and of its tex
 
 
 def test_text_of_figures_is_readable_on_a_phone_and_nothing_is_cut_off(committed: pd.DataFrame) -> None:
-    rows = committed[committed["domain"].isin(["agent", "object_rearrangement"])]
+    rows = committed[committed["domain"] == "agent"]
     for figure in (overview_dots(rows), comparison_bars(load_domain("agent"), rows, "closed loop success")):
         figure.draw_without_rendering()
         for text in (text for text in figure.findobj(Text) if text.get_text()):
