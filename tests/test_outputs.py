@@ -294,7 +294,7 @@ def test_a_figure_shows_names_letter_by_letter(figures: dict[str, list[Text]], f
     shown, formula = zip(*(one._preprocess_math(one.get_text()) for one in texts), strict=True)  # type: ignore[attr-defined]
     assert not any(formula)
     assert not any(UNPRINTABLE.search(one) for one in shown)
-    assert {*NAMES[:5]} <= {re.split(r" \(|, ", one)[0].strip() for one in shown}  # some figures show five curves
+    assert {*NAMES[:5]} <= {re.split(r" \(|, ", " ".join(one.split()))[0] for one in shown}  # some figures show five curves
 
 
 def test_texts_of_figures_are_no_formulas_and_none_is_left_out_and_long_ones_are_shortened() -> None:

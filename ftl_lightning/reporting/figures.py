@@ -179,7 +179,7 @@ def overview_dots(results: pd.DataFrame) -> Figure:
     for axes, shown in zip(axes_of, panels.values(), strict=False):
         _dots(axes, results, shown, series, colour_of)
     handles = {
-        label: Line2D([], [], color=colour_of[label], marker=MARKS[index % len(MARKS)], linestyle="", markersize=6)
+        figure_text(label): Line2D([], [], color=colour_of[label], marker=MARKS[index % len(MARKS)], linestyle="", markersize=6)
         for index, label in enumerate(series)
     }
     handles["the paper's"] = Line2D([], [], color="black", marker="D", markerfacecolor="none", linestyle="", markersize=6)
@@ -190,7 +190,7 @@ def overview_dots(results: pd.DataFrame) -> Figure:
 
 def _legend(figure: Figure, handles: Mapping[str, Artist]) -> None:
     """Draw a legend below a figure, an entry in a line."""
-    figure.legend(list(handles.values()), list(map(figure_text, handles)), fontsize=FONT, loc="outside lower left", frameon=False)
+    figure.legend(list(handles.values()), list(handles), fontsize=FONT, loc="outside lower left", frameon=False)
 
 
 def _series(measured: Sequence[Compared], defaults: Set[Compared]) -> dict[str, list[Compared]]:
@@ -253,7 +253,7 @@ def growth(domain: Domain, results: pd.DataFrame) -> Figure:
             numbers = [summarise(select(setting_rows, **{axis: count})) for count in counts]
             means = [number.mean for number in numbers if number]
             errors = [number.error or 0.0 for number in numbers if number]
-            axes.errorbar(counts, means, errors, marker="o", capsize=2, color=colour, label=setting)
+            axes.errorbar(counts, means, errors, marker="o", capsize=2, color=colour, label=figure_text(setting))
         axes.set(ylim=(0, 1.05))
         axes.set_xlabel(axis, fontsize=FONT)
         axes.set_ylabel(figure_text(" ".join(set(rows["metric"]))), fontsize=FONT)
@@ -286,13 +286,13 @@ def frontier(domain: Domain, rows: pd.DataFrame) -> Figure:
             means = by_temperature[["coverage", "accuracy"]].mean().sort_index()
             if means.empty:
                 continue
-            axes.plot(means["coverage"], means["accuracy"], color=colour, linewidth=1, label=label)
+            axes.plot(means["coverage"], means["accuracy"], color=colour, linewidth=1, label=figure_text(label))
             strengths = [1 - 0.75 * place / len(means) for place in range(len(means))]
             axes.scatter(means["coverage"], means["accuracy"], color=colour, alpha=strengths, s=22)  # type: ignore[arg-type]
         for method, mark in REFERENCE_MARKS.items():
             mean = select(rows, panel=panel, method=method)[["coverage", "accuracy"]].mean()
             if mean.notna().all():
-                axes.plot(mean["coverage"], mean["accuracy"], mark, color="black", markersize=8, label=method)
+                axes.plot(mean["coverage"], mean["accuracy"], mark, color="black", markersize=8, label=figure_text(method))
         axes.set(ylim=(-0.05, 1.05))
         axes.set_ylabel(figure_text(domain.main_metric), fontsize=FONT)
         _title(axes, panel)
@@ -308,7 +308,7 @@ def learning_time(curves: Mapping[str, Sequence[Measured]]) -> Figure:
     figure, (axes,) = _stacked([3.4], LINE * 1.3 * len(curves))
     for colour, (name, curve) in zip(COLOURS, curves.items(), strict=False):
         seconds, accuracy = ([getattr(point, axis) for point in curve] for axis in ("seconds", "accuracy"))
-        axes.plot(seconds, accuracy, "o-", color=colour, markersize=4, label=name)
+        axes.plot(seconds, accuracy, "o-", color=colour, markersize=4, label=figure_text(name))
     axes.axhline(reached(curves), color=PAPER_COLOUR, linestyle="dotted")
     axes.set(xscale="log", ylim=(-0.05, 1.05))
     axes.set_xlabel("seconds of learning", fontsize=FONT)

@@ -214,15 +214,6 @@ def test_an_adapter_that_is_named_beside_the_choice_is_of_the_named_rank(model: 
         assert {up.shape[-1] for up, _ in adapter.factors.values()} == {rank}
 
 
-@pytest.mark.slow
-def test_a_warning_that_another_loss_was_pretrained_with_comes_once(
-    model: FewShot, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(model.model, "config", replace(model.model.config, training={"model": {"loss": "v"}}))
-    model.learn(scenes(model), steps=2, form=AUTO)
-    assert sum("model.loss.kind" in record.message for record in caplog.records) == 1
-
-
 def test_what_is_learned_first_stops_by_itself_where_the_form_is_to_be_chosen() -> None:
     settings = InversionSettings(form=AUTO).changed(tolerance=None, adapter=2, modes=3)
     first = first_settings(settings)

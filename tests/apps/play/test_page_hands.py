@@ -61,11 +61,12 @@ def test_an_example_draws_itself_and_ends_when_somebody_draws(strokes: Browser) 
     assert strokes.js(picture) != empty
     strokes.until(lambda: strokes.text("next") == "Learned: samples")
     stroke(strokes)
-    assert strokes.text("next") == "Stroke 2 of 5"
+    strokes.until(lambda: strokes.text("next") == "Stroke 2 of 5")
     strokes.js("(playExample(), 1)")
     assert strokes.text("next") == "Stroke 2 of 5", "no example once there is a demonstration"
     cleared(strokes)
     strokes.js("(playExample(), 1)")
+    strokes.until(lambda: strokes.text("next") == "Learned: samples")
     strokes.until(lambda: strokes.text("next") == "Stroke 1 of 5")
     assert strokes.js(picture) == empty
 
