@@ -7,7 +7,7 @@ import numpy as np
 from tests.conftest import CONF
 from tests.domains.mocap_samples import folder
 
-OURS = ("agent", "driving", "mocap", "object_rearrangement", "own", "tabletop", "tabletop_wide")
+OURS = ("agent", "driving", "driving_wide", "mocap", "object_rearrangement", "own", "tabletop", "tabletop_wide")
 CONFIGURATIONS = [Path(f"{domain}.yaml") for domain in OURS] + sorted(
     path.relative_to(CONF) for method in ("bc", "cvae", "in_context") for path in (CONF / method).glob("*.yaml")
 )
@@ -18,6 +18,7 @@ DATA = {
     "object_rearrangement": ["--data.samples_per_concept=4", "--data.validation_per_concept=1"],
     "agent": FEW,
     "driving": FEW,
+    "driving_wide": FEW,
     "mocap": [],
     "own": [],
     "tabletop": ONE,
@@ -28,6 +29,7 @@ UNET = "width: 8, multipliers: [1, 2], film: true, broadcast: true, clock: 8"
 NETWORK = {
     "agent": [f"--model.denoiser_args={{{UNET}, initial_encoder: entities}}"],
     "driving": [f"--model.denoiser_args={{{MLP}, initial_encoder: set, initial_dim: 16, dropout: 0.1}}"],
+    "driving_wide": [f"--model.denoiser_args={{{MLP}, initial_encoder: entities, initial_dim: 16}}"],
     "mocap": [f"--model.denoiser_args={{{UNET}, skip: true, smooth: 2}}"],
     "object_rearrangement": [f"--model.denoiser_args={{{MLP}, dropout: 0.1}}"],
     "own": [f"--model.denoiser_args={{{MLP}, dropout: 0.1}}"],

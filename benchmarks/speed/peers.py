@@ -1,6 +1,6 @@
 """Run time of inversion and sampling against ``diffusers`` with the same network and work, in a single run.
 
-    python benchmarks/speed/peers.py [--pretrained pretrained/object_rearrangement] [--out results/peers.json] [--threads 2]
+    python benchmarks/speed/peers.py [--pretrained pretrained/object_rearrangement] [--out results/peers.json]
 
 Theirs is written as a user of ``diffusers`` would write it: its schedulers, its learning-rate schedule, the loop of its textual
 inversion (a table of embeddings of which all rows but the new ones are put back after each step; AdamW), and guidance by one batch
@@ -11,9 +11,11 @@ learn the same.
 noised demonstrations. *Batched* by hand: all plans of a concept, or of all concepts, at once, and all noised demonstrations of a
 step; for sampling also with the concept's features computed once instead of for every plan, which changes the network's interface.
 
-Equal noise gives equal plans with DDPM and DDIM, and learned concepts have equal losses on common noise; both are in the file.
-CleanDiffuser is not compared, as it has no release on PyPI. With a single thread, seconds are of processor time, which depends less
-on other load.
+*Few steps*: DPM-Solver++ of both with the same number of steps. Equal noise gives equal plans with DDPM and DDIM, and learned
+concepts have equal losses on common noise; both are in the file. CleanDiffuser is not compared, as it has no release on PyPI.
+
+One thread; seconds are of processor time, medians of calls that alternate between the candidates, in both orders, with the smallest
+and the largest.
 """
 
 import argparse
@@ -22,15 +24,15 @@ import importlib.metadata
 import json
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean, median
 from types import SimpleNamespace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import torch
-from diffusers import DDIMScheduler, DDPMScheduler
+from diffusers import DDIMScheduler, DDPMScheduler, DPMSolverMultistepScheduler
 from diffusers.optimization import get_scheduler
 from torch import Tensor, nn
 from torch.nn import functional
@@ -52,6 +54,8 @@ Batching = Literal["one by one", "batched"]
 CONCEPTS, PLANS, DENOISING, K, GUIDANCE = 10, 50, 100, 2, 1.2
 LEARNING_RATE = 0.1
 """Of ours and of theirs."""
+FEW = 10
+"""Steps of the few-step samplers."""
 SINGLES, SLICE = 3, 3
 """Plans, and steps of learning, that are timed of what goes one by one, and scaled up."""
 JUDGED = 512
@@ -95,6 +99,11 @@ def ddim_scheduler(model: GenerativeModel) -> Any:
     )
 
 
+def solver_scheduler(model: GenerativeModel) -> Any:
+    """DPM-Solver++ of second order."""
+    return DPMSolverMultistepScheduler(len(model.alpha_bar), beta_schedule="squaredcos_cap_v2", timestep_spacing="linspace")
+
+
 def guided(estimates: Tensor, weight: float) -> Tensor:
     """Classifier-free guidance by several concepts: ``(branch * plan, ...)`` of the empty one and K others, one after another."""
     empty, *conditional = estimates.chunk(1 + K)
@@ -118,11 +127,13 @@ def their_plans(
     Returns:
         ``(concept * count, horizon, state)``, normalised.
     """
-    scheduler.set_timesteps(DENOISING)
+    few = isinstance(scheduler, DPMSolverMultistepScheduler)
+    scheduler.set_timesteps(FEW if few else DENOISING)
     latents = torch.randn((embeddings.shape[1] * count, *shape), generator=draw) * scheduler.init_noise_sigma
     prompts = (embeddings if isinstance(network, Shared) else embeddings.repeat_interleave(count, dim=1)).flatten(0, 1)
     # DDIM's noise has to follow from the clean plan after it is clipped, as with us.
     options: dict[str, Any] = {"generator": draw} if isinstance(scheduler, DDPMScheduler) else {"use_clipped_model_output": True}
+    options = {} if few else options
     for t in scheduler.timesteps:
         inputs = scheduler.scale_model_input(torch.cat([latents] * len(embeddings)), t)
         estimate = guided(network(inputs, t, encoder_hidden_states=prompts).sample, GUIDANCE)
@@ -179,6 +190,18 @@ def loss_of(model: GenerativeModel, own: Demonstrations, learned: Composition) -
     return float(model.losses(own.states[rows], {}, together, draws, "epsilon").mean())
 
 
+class Timed(NamedTuple):
+    """Median, smallest and largest seconds of some calls."""
+
+    median: float
+    least: float
+    most: float
+
+    def times(self, factor: float) -> "Timed":
+        """Scaled up."""
+        return Timed(*(factor * value for value in self))
+
+
 @dataclass(frozen=True)
 class Work:
     """What both do.
@@ -188,7 +211,7 @@ class Work:
         concepts: demonstrations of each.
         settings: of our inversion.
         steps: of learning.
-        repeats: timed runs, of which the median is told.
+        repeats: timed calls of each.
     """
 
     model: GenerativeModel
@@ -197,15 +220,16 @@ class Work:
     steps: int
     repeats: int
 
-    def seconds(self, work: Callable[[], Any], repeats: int | None = None) -> float:
-        """The median of some runs, after one that is not timed."""
-        found, clock = [], time.process_time if torch.get_num_threads() == 1 else time.perf_counter
+    def seconds(self, works: Mapping[str, Callable[[], Any]], repeats: int | None = None) -> dict[str, Timed]:
+        """Processor seconds of each, after a call that is not timed, alternating."""
+        calls: dict[str, list[float]] = {name: [] for name in works}
         for turn in range(1 + (repeats or self.repeats)):
-            start = clock()
-            work()
-            if turn:
-                found.append(clock() - start)
-        return median(found)
+            for name in list(works) if turn % 2 else reversed(list(works)):
+                start = time.process_time()
+                works[name]()
+                if turn:
+                    calls[name].append(time.process_time() - start)
+        return {name: Timed(median(each), min(each), max(each)) for name, each in calls.items()}
 
     @functools.cached_property
     def compositions(self) -> list[Composition]:
@@ -224,11 +248,11 @@ class Work:
         own = torch.stack([composition.embeddings[:, 0] for composition in chosen], dim=1)
         return torch.cat((self.model.empty.expand(1, len(chosen), -1), own))
 
-    def ours(self, sampler: str = "ddpm", chosen: Sequence[Composition] | None = None) -> Tensor:
+    def ours(self, sampler: str = "ddpm", chosen: Sequence[Composition] | None = None, steps: int = DENOISING) -> Tensor:
         """Our plans ``(concept, plan, horizon, state)``."""
         chosen = self.compositions if chosen is None else chosen
         draws = [generator("cpu", 3, index) for index in range(len(chosen))]
-        return self.model.sample(chosen, PLANS, Sampling(sampler, DENOISING, 1.0), draws)
+        return self.model.sample(chosen, PLANS, Sampling(sampler, steps, 1.0), draws)
 
 
 def equality(work: Work) -> dict[str, float]:
@@ -242,24 +266,32 @@ def equality(work: Work) -> dict[str, float]:
     return found
 
 
-def sampling(work: Work) -> dict[str, float]:
+def sampling(work: Work) -> dict[str, Timed]:
     """Seconds of all plans of all concepts."""
-    scheduler, chosen = ddpm_scheduler(work.model), work.compositions
+    scheduler, solver, chosen = ddpm_scheduler(work.model), solver_scheduler(work.model), work.compositions
     plain, shared = Conditional(work.model), Shared(work.model)
 
-    def theirs(network: Conditional, some: Sequence[Composition], count: int = PLANS) -> Tensor:
-        return their_plans(network, scheduler, work.branches(some), generator("cpu", 3), count, work.shape)
+    def theirs(network: Conditional, some: Sequence[Composition], count: int = PLANS, by: Any = scheduler) -> Tensor:
+        return their_plans(network, by, work.branches(some), generator("cpu", 3), count, work.shape)
 
+    single = "theirs, as its examples do (scaled)"
+    one = work.seconds({single: lambda: theirs(plain, chosen[:1], 1)}, SINGLES)[single]
     return {
-        "ours": work.seconds(work.ours),
-        "theirs, as its examples do (scaled)": work.seconds(lambda: theirs(plain, chosen[:1], 1), SINGLES) * PLANS * len(chosen),
-        "theirs, batched, a concept after another": work.seconds(lambda: [theirs(plain, [one]) for one in chosen]),
-        "theirs, batched, all concepts at once": work.seconds(lambda: theirs(plain, chosen)),
-        "theirs, batched, all at once, concepts computed once": work.seconds(lambda: theirs(shared, chosen)),
+        **work.seconds(
+            {
+                "ours": work.ours,
+                "theirs, batched, a concept after another": lambda: [theirs(plain, [each]) for each in chosen],
+                "theirs, batched, all concepts at once": lambda: theirs(plain, chosen),
+                "theirs, batched, all at once, concepts computed once": lambda: theirs(shared, chosen),
+                "ours, few steps": lambda: work.ours("dpm_solver", steps=FEW),
+                "theirs, few steps, all at once, concepts computed once": lambda: theirs(shared, chosen, by=solver),
+            }
+        ),
+        single: one.times(PLANS * len(chosen)),
     }
 
 
-def learning(work: Work) -> tuple[dict[str, float], dict[str, Any]]:
+def learning(work: Work) -> tuple[dict[str, Timed], dict[str, Any]]:
     """Seconds of learning all concepts and one, and the losses of what was learned."""
     model, samples = work.model, work.settings.budget.samples
     normalised = [model.encode(own.states, {}) for own in work.concepts]
@@ -277,20 +309,23 @@ def learning(work: Work) -> tuple[dict[str, float], dict[str, Any]]:
         name: (loss_of(model, one, found.composition), loss_of(model, one, composition))
         for (name, found), one, composition in zip(own.items(), work.concepts, other, strict=True)
     }
-    seconds = {
-        "ours, together": work.seconds(lambda: invert(model, every, work.settings, work.steps)),
-        "ours, one": work.seconds(lambda: invert(model, work.concepts[0], work.settings, work.steps)),
-        "theirs, batched, a concept after another": work.seconds(all_of_theirs, 1),
-        "theirs, batched, one": work.seconds(lambda: theirs(0, work.steps, "batched")),
-        "theirs, as its examples do, one (scaled)": work.seconds(lambda: theirs(0, SLICE, "one by one"), 1) / SLICE * work.steps,
-    }
-    seconds["theirs, as its examples do (scaled)"] = len(normalised) * seconds["theirs, as its examples do, one (scaled)"]
-    told = {
+    seconds = work.seconds(
+        {
+            "ours, together": lambda: invert(model, every, work.settings, work.steps),
+            "ours, one": lambda: invert(model, work.concepts[0], work.settings, work.steps),
+            "theirs, batched, a concept after another": all_of_theirs,
+            "theirs, batched, one": lambda: theirs(0, work.steps, "batched"),
+        }
+    )
+    single = "theirs, as its examples do, one (scaled)"
+    seconds[single] = work.seconds({single: lambda: theirs(0, SLICE, "one by one")}, 1)[single].times(work.steps / SLICE)
+    seconds["theirs, as its examples do (scaled)"] = seconds[single].times(len(normalised))
+    losses_of = {
         "ours, mean": round(mean(one for one, _ in losses.values()), 5),
         "theirs, mean": round(mean(one for _, one in losses.values()), 5),
         "ours over theirs, largest": round(max(one / another for one, another in losses.values()), 4),
     }
-    return seconds, told
+    return seconds, losses_of
 
 
 def main() -> None:
@@ -298,12 +333,11 @@ def main() -> None:
     parser.add_argument("--pretrained", default="pretrained/object_rearrangement")
     parser.add_argument("--config", default="conf/object_rearrangement.yaml")
     parser.add_argument("--out", default="results/peers.json")
-    parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--steps", type=int, default=100, help="of learning")
     parser.add_argument("--concepts", type=int, default=CONCEPTS)
-    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--repeats", type=int, default=5)
     options = parser.parse_args()
-    torch.set_num_threads(options.threads)
+    torch.set_num_threads(1)
     load = os.getloadavg()[0]
     model = read_model(GenerativeModel, options.pretrained)
     data = InversionData(model.config.domain, suite="validation", seed=0).demonstrations
@@ -314,7 +348,7 @@ def main() -> None:
     found: dict[str, Any] = {
         "machine": {
             "capability": torch.backends.cpu.get_cpu_capability(),
-            "threads": options.threads,
+            "threads": 1,
             "torch": torch.__version__,
             "diffusers": importlib.metadata.version("diffusers"),
         },
@@ -334,13 +368,17 @@ def main() -> None:
         advance()
         inversion, found["loss of learned concepts"] = learning(work)
         advance()
-    found["sampling, seconds"] = {name: round(value, 4) for name, value in generation.items()}
-    found["learning, seconds"] = {name: round(value, 4) for name, value in inversion.items()}
+    found["sampling, seconds"] = {name: [round(value, 3) for value in timed] for name, timed in generation.items()}
+    found["learning, seconds"] = {name: [round(value, 3) for value in timed] for name, timed in inversion.items()}
     found["ratio"] = {
-        "sampling": {name: round(value / generation["ours"], 2) for name, value in generation.items() if "theirs" in name},
+        "sampling": {
+            name: round(timed.median / generation["ours, few steps" if "few" in name else "ours"].median, 2)
+            for name, timed in generation.items()
+            if "theirs" in name
+        },
         "learning": {
-            name: round(value / inversion["ours, one" if ", one" in name else "ours, together"], 2)
-            for name, value in inversion.items()
+            name: round(timed.median / inversion["ours, one" if ", one" in name else "ours, together"].median, 2)
+            for name, timed in inversion.items()
             if "theirs" in name
         },
     }

@@ -42,15 +42,13 @@ def threads(count: int) -> str:
 
 def peers(found: Mapping[str, Any]) -> str:
     """Beside diffusers."""
-    lines = head("sampling", "seconds", "theirs over ours")
-    lines += [cells("ours, all concepts at once", f"{found['sampling, seconds']['ours']:.2f}", "")]
-    for name, ratio in found["ratio"]["sampling"].items():
-        lines.append(cells(name, f"{found['sampling, seconds'][name]:.2f}", f"{ratio:.1f}"))
-    lines += ["", *head("learning", "seconds", "theirs over ours")]
-    for name in ("ours, together", "ours, one"):
-        lines.append(cells(name, f"{found['learning, seconds'][name]:.2f}", ""))
-    for name, ratio in found["ratio"]["learning"].items():
-        lines.append(cells(name, f"{found['learning, seconds'][name]:.2f}", f"{ratio:.1f}"))
+    lines: list[str] = []
+    for what in ("sampling", "learning"):
+        lines += ["", *head(what, "seconds (smallest to largest)", "theirs over ours")]
+        for name, (middle, least, most) in found[f"{what}, seconds"].items():
+            ratio = found["ratio"][what].get(name)
+            seconds = f"{middle:.2f} ({least:.2f} to {most:.2f})"
+            lines.append(cells(name, seconds, "" if ratio is None else f"{ratio:.1f}"))
     machine, work = found["machine"], found["work"]
     where = f"{machine['capability']}, {threads(machine['threads'])}, diffusers {machine['diffusers']}; {work['concepts']} concepts"
     where += (
@@ -60,7 +58,7 @@ def peers(found: Mapping[str, Any]) -> str:
     differences = found["same noise, largest difference of plans"]
     same = f"\nFrom the same noise plans differ by at most {100 * max(differences.values()):.2g} % of their range. "
     same += f"Mean loss of the learned concepts: ours {losses['ours, mean']:.4f}, theirs {losses['theirs, mean']:.4f}.\n"
-    return "\n".join(lines) + "\n" + same + told(where, found["load"])
+    return "\n".join(lines[1:]) + "\n" + same + told(where, found["load"])
 
 
 def batching(found: Mapping[str, Any]) -> str:

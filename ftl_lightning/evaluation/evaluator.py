@@ -157,7 +157,8 @@ class Evaluator(pl.Callback):
             random.restore(pl_module.device)
         pl_module.log_dict({f"val/{name}": value for name, value in means.items()}, batch_size=1, sync_dist=True)
         if trainer.is_global_zero:
-            self._draw(trainer, module, project=not self._projected)  # training embeddings do not change while fitting
+            ended = trainer.state.fn != "fit" or trainer.global_step >= trainer.max_steps  # films take as long as the training
+            self._draw(trainer, module, project=not self._projected, film=ended)  # training embeddings do not change while fitting
 
     def on_test_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Evaluate in ``test`` and at the end of ``invert``."""
@@ -188,12 +189,12 @@ class Evaluator(pl.Callback):
             reference_lines |= lines(real) if compared else {}
         return reference_lines
 
-    def _draw(self, trainer: pl.Trainer, module: Evaluable, project: bool = True) -> None:
-        """Log pictures and concept embeddings to TensorBoard."""
+    def _draw(self, trainer: pl.Trainer, module: Evaluable, project: bool = True, film: bool = True) -> None:
+        """Log pictures, films and concept embeddings to TensorBoard."""
         for logger in _boards(trainer):
             try:
                 if self.figures:
-                    draw(logger, self.judged, module.domain, self.figures, trainer.global_step)
+                    draw(logger, self.judged, module.domain, self.figures, trainer.global_step, film)
             except Exception as error:  # any error of a domain's pictures: results are already saved
                 _LOG.warning("domain %s: its pictures cannot be drawn: %r", module.domain.name, error)
             if project:

@@ -39,14 +39,18 @@ COLUMNS = ("text", "set", "component", "part")
 """Metadata columns of the projector; '-' for a point without a component."""
 
 
-def draw(logger: TensorBoardLogger, judged: Sequence[TaskResult], domain: Domain, figures: int, step: int) -> None:
-    """Log a figure of each task's plans and films of the first plan and the first episode.
+def draw(
+    logger: TensorBoardLogger, judged: Sequence[TaskResult], domain: Domain, figures: int, step: int, filmed: bool = True
+) -> None:
+    """Log a figure of each task's plans and, if ``filmed``, films of the first plan and the first episode.
 
     A figure has as many samples, and at most as many demonstrations, as ``figures``, 1 or more.
     """
     for behaviour in judged:
         name = f"{behaviour.task.setting}/{behaviour.task.name}"
         logger.experiment.add_figure(f"{PICTURES}/{name}", picture(behaviour, domain, figures), step)
+        if not filmed:
+            continue
         if (film := domain.show.film) is not None:
             log_animation(logger, f"{FILMS}/{name}", captioned(film(behaviour.states[0]), title(behaviour)), step)
         if domain.closed_loop and domain.closed_loop.film and behaviour.rollout is not None and behaviour.followed is not None:

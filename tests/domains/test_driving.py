@@ -14,8 +14,10 @@ from ftl_lightning.domains.driving import expert, traffic
 from ftl_lightning.domains.driving.environment import DrivingEnvironment
 from ftl_lightning.domains.driving.scenarios import SCENARIOS, advance, arrived, make, observe, restore, save
 from ftl_lightning.domains.driving.traffic import (
+    BARRIER,
     NAMES,
     OBSERVED,
+    PRACTICE,
     RULES,
     SCENARIO,
     SCENE,
@@ -335,7 +337,7 @@ def test_after_an_episode_every_vehicle_drives_straight_on(name: str, seconds: f
     assert (longer[2:, 2:] == 0).all()
 
 
-def final(name: str, decide: Any, seed: int) -> Any:
+def final(name: str, decide: Any, seed: int = 0) -> Any:
     """Environment after an episode of decisions by name; ``decide`` maps an environment to a decision."""
     env = make(name)
     env.reset(seed=seed)
@@ -378,6 +380,32 @@ def test_to_enter_a_column_of_vehicles_without_a_gap_is_an_offence_and_an_overta
     assert arrived(env, "overtake")  # type: ignore[arg-type]
 
 
+def test_a_stop_sign_is_passed_after_a_halt_and_a_bridge_or_lane_with_room_alone() -> None:
+    assert final("stop sign", lambda env: "IDLE").vehicle.offence
+
+    def halting(env: Any) -> str:
+        near = env.line - env.vehicle.position[0] < 16
+        return "FASTER" if env.vehicle.halted else "SLOWER" if near else "IDLE"
+
+    halted = final("stop sign", halting)
+    assert arrived(halted, "stop sign")
+    ends = [final("narrow bridge", lambda env: "FASTER", seed).vehicle.offence for seed in range(8)]
+    assert {*ends} == {False, True}
+    assert any(final("lane ends", lambda env: "LANE_RIGHT", seed).vehicle.offence for seed in range(8))
+
+
+def test_a_barrier_is_gone_once_the_train_has_passed_and_a_leader_halts_and_goes_on() -> None:
+    env = final("barrier", lambda env: "SLOWER", next(seed for seed in range(9) if start("barrier", seed).train))  # type: ignore[attr-defined]
+    assert all(vehicle.position[1] > 5 for vehicle in env.train)
+    assert len(env.road.vehicles) == 1 + len(env.train)
+    env = start("stop and go")
+    speeds = []
+    while env.time < env.goes + 4:  # type: ignore[attr-defined]
+        advance(env, env.action_type.actions_indexes["SLOWER"])  # type: ignore[attr-defined, arg-type]
+        speeds.append(env.leader.speed)  # type: ignore[attr-defined]
+    assert min(speeds) < 1 < speeds[-1]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", RULES)
 def test_constant_decisions_fail_in_half_of_the_scenes_or_more(name: str) -> None:
@@ -387,6 +415,6 @@ def test_constant_decisions_fail_in_half_of_the_scenes_or_more(name: str) -> Non
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", RULES)
+@pytest.mark.parametrize("name", [*RULES, *PRACTICE, BARRIER])
 def test_the_expert_keeps_the_rules(name: str) -> None:
     assert expert.drive(name, 0)[1]

@@ -1,5 +1,5 @@
 """Driving: highway-env scenarios; the roundabout is learned from five demonstrations (paper, section 5.1)."""
 
-from ftl_lightning.domains.driving.domain import DOMAIN
+from ftl_lightning.domains.driving.domain import DOMAIN, WIDE
 
-__all__ = ["DOMAIN"]
+__all__ = ["DOMAIN", "WIDE"]

@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -28,7 +28,8 @@ if TYPE_CHECKING:
     from ftl_lightning.domains.driving.environment import DrivingEnvironment
 
 Make = Callable[[str, InitialStates, Demonstrations | None, int], Policy | None]
-SHOWN = 100  # demonstrations per training scenario for the look-up and the regressions
+SHOWN, SHOWN_WITH_RULES = 100, 60
+"""Demonstrations per training scenario, and per training scenario with rules, for the look-up and the regressions."""
 
 
 def _simulation(goal: str) -> "AbstractEnv":
@@ -58,7 +59,9 @@ def _random(goal: str, starts: InitialStates, demonstrations: Demonstrations | N
 
 def _transitions(goal: str, demonstrations: Demonstrations | None) -> tuple[Observed, Tensor]:
     """Observations ``(n, *shape)`` by name and next states ``(n, 7)`` of all steps of the demonstrations."""
-    examples = traffic.training_set("train", SHOWN).select(goal) if demonstrations is None else demonstrations
+    examples = demonstrations
+    if examples is None:
+        examples = traffic.training_set("train", SHOWN_WITH_RULES if goal in traffic.PRACTICE else SHOWN, scenarios=(goal,))
     pairs = [(row, time) for row, length in enumerate(examples.lengths.tolist()) for time in range(length - 1)]
     rows, times = torch.tensor(pairs).T
     return {name: values[rows, times] for name, values in examples.observed.items()}, examples.states[rows, times + 1]
@@ -140,17 +143,27 @@ POLICIES = {
 RENDERING = "ftl_lightning.domains.driving.rendering"
 
 
+TRAINING = traffic.TRAINING_CONCEPTS, traffic.WIDE_CONCEPTS
+
+
 class Expert:
-    """Source of successful episodes of the expert: shipped ones, those in ``root``, or new ones; blind: it knows only
-    observations.
+    """Source of successful episodes of the expert: shipped ones, those in ``root``, or new ones.
+
+    Args:
+        root: folder of episodes of the training scenarios; ``None`` for the shipped ones.
+        blind: whether the expert knows only observations.
+        wide: whether it is that of :data:`WIDE`.
     """
 
-    def __init__(self, root: Path | None = None, blind: bool = False) -> None:
-        self.root, self.blind = root, blind
+    def __init__(self, root: Path | None = None, blind: bool = False, wide: bool = False) -> None:
+        self.root, self.blind, self.wide = root, blind, wide
 
     def split(self, name: Split, count: int, seed: int) -> Demonstrations:
         """The same for every seed, as generation takes half an hour."""
-        return traffic.training_set(name, count, self.root)
+        return self._own(traffic.training_set(name, count, self.root, TRAINING[self.wide]))
+
+    def _own(self, episodes: Demonstrations) -> Demonstrations:
+        return replace(episodes, domain=traffic.WIDE_NAME) if self.wide else episodes
 
     def draw(self, task: str, count: int, seed: int, workers: int = 1) -> Demonstrations:
         traffic.check_scenario(task)
@@ -160,7 +173,7 @@ class Expert:
 
         settings = {"domain": traffic.NAME, "task": task, "count": count, "seed": seed, "config": scenario(task).config}
         settings |= {"search": SEARCH[task], "beyond": traffic.HORIZON, **({"blind": asdict(BLIND)} if self.blind else {})}
-        return cached(settings, count, lambda progress: demonstrations(task, count, seed, workers, progress, self.blind))
+        return self._own(cached(settings, count, lambda progress: demonstrations(task, count, seed, workers, progress, self.blind)))
 
     def starts(self, task: str, count: int, seed: int) -> InitialStates:
         """Initial states of new episodes, scenes ``(count, 37)``."""
@@ -240,3 +253,16 @@ DOMAIN = Domain(
         paper=Paper(traffic.PUBLISHED, omega="learned", ours="learned"),
     ),
 )
+WIDE = replace(
+    DOMAIN,
+    name=traffic.WIDE_NAME,
+    concepts=replace(
+        DOMAIN.concepts,
+        training=TRAINING[True],
+        suites=traffic.WIDE_SUITES,
+        table=Path(__file__).parent / "wide_embeddings.safetensors",
+    ),
+    source=partial(Expert, wide=True),
+    comparison=replace(DOMAIN.comparison, paper=None),
+)
+"""Driving with scenarios with rules in pretraining."""

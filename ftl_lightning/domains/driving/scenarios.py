@@ -20,7 +20,7 @@ from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.objects import RoadObject
 from numpy.typing import NDArray
 
-from ftl_lightning.domains.driving import rules
+from ftl_lightning.domains.driving import practice, rules
 from ftl_lightning.domains.driving.fast import FastVehicle, accelerate
 from ftl_lightning.domains.driving.traffic import FEATURES, VEHICLES, check_scenario
 
@@ -185,6 +185,12 @@ SCENARIOS = {
     "give way": _ruled(rules.GiveWay),
     "ramp": _ruled(rules.Ramp),
     "overtake": _ruled(rules.Overtake),
+    "stop and go": _ruled(practice.StopAndGo),
+    "narrow bridge": _ruled(practice.NarrowBridge),
+    "parked car": _ruled(practice.ParkedCar),
+    "lane ends": _ruled(practice.LaneEnds),
+    "stop sign": _ruled(practice.StopSign),
+    "barrier": _ruled(practice.Barrier),
 }
 
 

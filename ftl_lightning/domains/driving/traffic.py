@@ -1,6 +1,7 @@
 """Driving without the simulator: observations, initial states, tasks, the paper's numbers, and shipped demonstrations."""
 
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -40,7 +41,12 @@ BELIEF, SIMULATION, STEP = "belief", "simulation", "step"
 TRAINING_CONCEPTS = ("highway", "exit", "merge", "intersection")
 OTHER_ROUNDABOUTS = ("roundabout of three lanes", "roundabout of one lane")
 RULES = ("red light", "give way", "ramp", "overtake")
-NAMES = (*TRAINING_CONCEPTS, "roundabout", "roundabout third exit", *OTHER_ROUNDABOUTS, *RULES)
+WIDE_NAME = "driving_wide"
+PRACTICE = ("stop and go", "narrow bridge", "parked car", "lane ends", "stop sign")
+WIDE_CONCEPTS = (*TRAINING_CONCEPTS, *PRACTICE)
+"""Training concepts of the wide model: also scenarios with rules, none of which is an evaluation task."""
+BARRIER = "barrier"
+NAMES = (*TRAINING_CONCEPTS, "roundabout", "roundabout third exit", *OTHER_ROUNDABOUTS, *RULES, *PRACTICE, BARRIER)
 """Scenario names; scenes contain the index."""
 
 
@@ -97,20 +103,26 @@ SUITES = {
     ),
 }
 """``validation`` is another route through the same roundabout; ``more`` and ``other roundabouts`` are not used for tuning."""
+WIDE_SUITES = SUITES | {
+    "training": training_suite(WIDE_CONCEPTS),
+    "validation": Suite((EvaluationTask("new scenario", BARRIER, learned=(BARRIER,)),)),
+}
 
 
 SHIPPED = Path(__file__).parent / "demonstrations"  # a file of expert episodes per training scenario; see its data card
 HELD_OUT = 10  # validation episodes per scenario, the last of its file
 
 
-def training_set(name: Split, count: int, folder: Path | None = None) -> Demonstrations:
+def training_set(
+    name: Split, count: int, folder: Path | None = None, scenarios: Sequence[str] = TRAINING_CONCEPTS
+) -> Demonstrations:
     """The first ``count`` shipped episodes per training scenario, or those of ``folder``; for ``'validation'``, held-out episodes.
 
     Raises:
         UserError: if there are fewer, or no file.
     """
     parts = []
-    for scenario in TRAINING_CONCEPTS:
+    for scenario in scenarios:
         shipped = Demonstrations.load((folder or SHIPPED) / f"{scenario}.safetensors")
         rows = list(range(len(shipped)))
         pool = rows[-HELD_OUT:] if name == "validation" else rows[:-HELD_OUT]

@@ -1,0 +1,181 @@
+"""Accuracy, diversity, energy score and time of samplers with fewer steps, beside DDPM with all steps, with the models that ship.
+
+    python benchmarks/speed/samplers.py [--domains object_rearrangement agent] [--root FOLDER] [--out results/samplers.json]
+
+Concepts of each domain's validation suite are learned in the shipped form, for each seed. Every sampler generates plans from the
+same new initial states. A sampler is *equal* if accuracy, diversity and energy score are each at most one standard error worse than
+those of DDPM; standard errors are over concepts and seeds, of paired differences. Diversity is the mean distance between plans from
+the same state, and the energy score (less is better) that for fresh behaviour from this state. Where plans are executed, accuracy
+is that of episodes. Seconds are of processor time for 500 plans, medians of interleaved calls. ``--root`` is the folder of
+recordings of human motion. What was measured is kept, and a run that is started again goes on from there.
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from statistics import mean, median, stdev
+from typing import Any
+
+import torch
+
+from ftl_lightning.data.distances import PathFeatures
+from ftl_lightning.data.features import InitialStates
+from ftl_lightning.data.places import first_windows
+from ftl_lightning.few_shot.learner import FewShot
+from ftl_lightning.few_shot.tuned import settings_of
+from ftl_lightning.igm.composition import Composition
+from ftl_lightning.igm.forms.quality import encoded
+from ftl_lightning.igm.samplers import Sampling
+from ftl_lightning.services.configuration import load
+from ftl_lightning.services.progress import bar
+from ftl_lightning.services.tensor_file import write_text
+from ftl_lightning.training.data import InversionData
+
+DOMAINS = ("object_rearrangement", "agent", "driving", "mocap", "tabletop")
+STEPS = (3, 5, 10, 20)
+SEEDS = (0, 1, 2)
+PLANS, FRESH, EACH, TIMED, REPEATS = 50, 20, 8, 500, 5
+"""Plans whose accuracy is measured, fresh demonstrations, plans from each of their states, timed plans, and timed calls."""
+FRESH_SEED = 4000
+"""Seed of fresh demonstrations, which no other part of the program uses."""
+
+
+def samplers(temperature: float) -> dict[str, Sampling]:
+    """By name: DDPM, and fewer steps at the same temperature and at higher ones, as these samplers have noise at the start only."""
+    temperatures = sorted({temperature, 0.3, 0.6, 1.0}) if 0 < temperature < 0.3 else [temperature]
+    fewer = [Sampling("dpm_solver", steps, warmth) for steps in STEPS for warmth in temperatures]
+    return {f"{each.sampler} {each.steps}, {each.temperature:g}": each for each in (Sampling("ddpm", 100, temperature), *fewer)}
+
+
+def repeated(states: InitialStates, times: int) -> InitialStates:
+    """Each initial state ``times`` times."""
+    return states.take(torch.arange(len(states)).repeat_interleave(times))
+
+
+class Judged:
+    """A learned concept that is judged with one sampler after another.
+
+    Args:
+        model: model.
+        concept: concept.
+        goal: task.
+        seed: seed of initial states and noise.
+        root: folder of recordings; ``None`` where none are needed.
+    """
+
+    def __init__(self, model: FewShot, concept: Composition, goal: str, seed: int, root: Path | None) -> None:
+        self.model, self.concept, self.goal, self.seed = model, concept, goal, seed
+        source, domain = model.domain.source(root), model.domain
+        self.starts = source.starts(goal, PLANS, FRESH_SEED + seed) if domain.observed else None
+        fresh = source.draw(goal, FRESH, FRESH_SEED + seed)
+        self.fresh = fresh.initial_states
+        self.truth = encoded(model.model, first_windows(fresh, model.model.horizon), self.fresh)
+        self.features = PathFeatures(self.truth)
+
+    def measured(self, sampling: Sampling) -> dict[str, float]:
+        """Accuracy, diversity and energy score."""
+        options: dict[str, Any] = {"sampler": sampling.sampler, "steps": sampling.steps, "temperature": sampling.temperature}
+        domain, many = self.model.domain, repeated(self.fresh, EACH)
+        plans = self.model.sample(self.concept, FRESH * EACH, many if domain.observed else None, seed=self.seed + 1, **options)
+        paths = encoded(self.model.model, plans.states, many).unflatten(0, (FRESH, EACH))
+        flat = paths.flatten(2)
+        if domain.comparison.headline.startswith("closed loop") and self.starts is not None:
+            outcomes = self.model.execute(self.concept, self.starts, self.goal, seed=self.seed, **options).outcomes
+            accuracy = outcomes[domain.comparison.headline.removeprefix("closed loop ")]
+        else:
+            judged = self.model.sample(self.concept, PLANS, self.starts, seed=self.seed, **options)
+            accuracy = self.model.evaluate(judged, self.goal)[domain.main_metric]
+        return {
+            "accuracy": accuracy,
+            "diversity": float(torch.cdist(flat, flat).sum(dim=(1, 2)).mean() / (EACH * (EACH - 1))),
+            "energy": float(self.features.scores(paths, self.truth).mean()),
+        }
+
+    def seconds(self, sampling: Sampling) -> float:
+        """Processor seconds of :data:`TIMED` plans."""
+        options: dict[str, Any] = {"sampler": sampling.sampler, "steps": sampling.steps, "temperature": sampling.temperature}
+        starts = None if self.starts is None else repeated(self.starts, TIMED // PLANS)
+        begun = time.process_time()
+        self.model.sample(self.concept, TIMED, starts, **options)
+        return time.process_time() - begun
+
+
+def compared(rows: Sequence[Mapping[str, Any]], name: str, base: str) -> dict[str, Any]:
+    """Means of a sampler, and whether it is equal to ``base``."""
+    of = {(row["task"], row["seed"]): row for row in rows if row["sampler"] == name}
+    pairs = [(of[row["task"], row["seed"]], row) for row in rows if row["sampler"] == base]
+    means = {key: round(mean(row[key] for row, _ in pairs), 4) for key in ("accuracy", "diversity", "energy")}
+    worse = []
+    for key, sign in (("accuracy", 1), ("diversity", 1), ("energy", -1)):
+        lost = [sign * (other[key] - row[key]) for row, other in pairs]
+        error = stdev(lost) / len(lost) ** 0.5 if len(lost) > 1 else 0.0
+        if mean(lost) > error + 1e-9:
+            worse.append(key)
+    return {**means, "worse": worse}
+
+
+def measure(domain: str, root: Path | None, rows: list[dict[str, Any]], out: Path) -> dict[str, float]:
+    """Add rows that are missing; return seconds by sampler."""
+    model = FewShot.from_pretrained(domain)
+    kinds = samplers(model.tuned.sampling.temperature)
+    few = load(settings_of(domain), "invert")["data"]["init_args"].get("demonstrations_per_concept", 5)
+    suite = model.domain.concepts.suites["validation"]
+    goals = [task.goal for task in suite.tasks if task.initial == "new" and task.learned == (task.goal,)]
+    timed: Judged | None = None
+    for seed in SEEDS:
+        known = {(row["task"], row["sampler"]) for row in rows if row["domain"] == domain and row["seed"] == seed}
+        missing = [goal for goal in dict.fromkeys(goals) if not {(goal, name) for name in kinds} <= known]
+        if not missing and timed:
+            continue
+        data = InversionData(
+            domain, "validation", demonstrations_per_concept=few, seed=seed, root=None if root is None else str(root)
+        )
+        learned = model.learn_all(data.demonstrations, seed=seed)
+        with bar(f"{domain}, seed {seed}", len(missing) * len(kinds)) as advance:
+            for goal in missing or goals[:1]:
+                judged = Judged(model, learned[goal], goal, seed, root)
+                timed = timed or judged
+                for name, sampling in kinds.items() if missing else ():
+                    if (goal, name) not in known:
+                        rows.append({"domain": domain, "task": goal, "seed": seed, "sampler": name, **judged.measured(sampling)})
+                        write_text(out, json.dumps({"rows": rows}, indent=1) + "\n")
+                    advance()
+    assert timed is not None
+    calls: dict[str, list[float]] = {name: [] for name in kinds}
+    for turn in range(REPEATS):
+        for name in list(kinds) if turn % 2 else reversed(list(kinds)):
+            calls[name].append(timed.seconds(kinds[name]))
+    return {name: median(each) for name, each in calls.items()}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--domains", nargs="+", default=list(DOMAINS), choices=DOMAINS)
+    parser.add_argument("--root", type=Path, help="folder of the recordings of human motion")
+    parser.add_argument("--out", type=Path, default=Path("results/samplers.json"))
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    content = json.loads(options.out.read_text()) if options.out.is_file() else {}
+    rows, table = content.get("rows", []), content.get("table", {})
+    for domain in options.domains:
+        seconds = measure(domain, options.root if domain == "mocap" else None, rows, options.out)
+        own = [row for row in rows if row["domain"] == domain]
+        base = next(iter(seconds))
+        shipped = FewShot.from_pretrained(domain).tuned.sampling
+        table[domain] = {
+            name: {
+                **compared(own, name, base),
+                "seconds": round(seconds[name], 3),
+                "faster": round(seconds[base] / seconds[name], 1),
+                "ships": name == f"{shipped.sampler} {shipped.steps}, {shipped.temperature:g}",
+            }
+            for name in seconds
+        }
+        print(domain, json.dumps(table[domain], indent=1))
+        write_text(options.out, json.dumps({"table": table, "rows": rows}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
