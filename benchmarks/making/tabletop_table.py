@@ -120,6 +120,17 @@ def wide_tasks(rows: pd.DataFrame) -> str:
     return table(head, lines)
 
 
+def eight_tasks(rows: pd.DataFrame) -> str:
+    """Eight tasks that pretraining does not show, a line for each, and their mean."""
+    new, lines = rows[rows["setting"] == "new concept, eight tasks"], []
+    methods = ("FTL-IGM", REFERENCES[0])
+    for task in new["task"].unique():
+        own = new[new["task"] == task]
+        lines.append([task, *(cells(own[own["method"] == method])[0] for method in methods)])
+    lines.append(["mean", *(cells(new[new["method"] == method])[0] for method in methods)])
+    return table(["eight tasks, one seed", "with an adapter", "*expert*"], lines)
+
+
 def wide_training(rows: pd.DataFrame) -> str:
     """What the wide model was pretrained on, a line for each task."""
     lines = []
@@ -161,7 +172,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parts = [new_task(rows), training_tasks(rows), failures(found["failures"]), eyes(found["localisation"])]
     write_text(chosen.out / "tabletop.md", "\n\n".join(parts) + "\n")
     rows = rows_of(chosen.results / "tabletop_wide.csv")
-    parts = [wide_tasks(rows), targets(found["targets"]), wide_training(rows)]
+    parts = [wide_tasks(rows), eight_tasks(rows), targets(found["targets"]), wide_training(rows)]
     write_text(chosen.out / "tabletop_wide.md", "\n\n".join(parts) + "\n")
 
 
