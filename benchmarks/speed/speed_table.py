@@ -31,7 +31,7 @@ def head(*titles: str) -> list[str]:
 
 def told(machine: str, loads: list[float]) -> str:
     """Where it was measured, and whether other work was going on."""
-    busy = f"load {max(loads):.1f} before, of other work or of the benchmark before"
+    busy = f"load {max(loads):.1f}, of other work or of the benchmark before"
     return f"\n{machine}, {busy if loads[0] > NOT_QUIET else 'on an otherwise idle machine'}.\n"
 
 
@@ -58,7 +58,8 @@ def peers(found: Mapping[str, Any]) -> str:
     differences = found["same noise, largest difference of plans"]
     same = f"\nFrom the same noise plans differ by at most {100 * max(differences.values()):.2g} % of their range. "
     same += f"Mean loss of the learned concepts: ours {losses['ours, mean']:.4f}, theirs {losses['theirs, mean']:.4f}.\n"
-    return "\n".join(lines[1:]) + "\n" + same + told(where, found["load"])
+    before, after = found["load"]
+    return "\n".join(lines[1:]) + "\n" + same + told(where, [max(before, after - machine["threads"])])
 
 
 def batching(found: Mapping[str, Any]) -> str:
