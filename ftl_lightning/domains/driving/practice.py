@@ -4,7 +4,7 @@ from typing import Any
 
 from highway_env.vehicle.objects import Obstacle
 
-from ftl_lightning.domains.driving.rules import WIDTH, Sign, Street
+from ftl_lightning.domains.driving.rules import WIDTH, Gate, Sign, Street
 
 
 class Parked(Sign):
@@ -61,8 +61,7 @@ class NarrowBridge(Street):
         end = self.place + self.LENGTH
         if not self.place <= self.vehicle.position[0] <= end:
             return False
-        others = [vehicle for vehicle in self.road.vehicles if abs(vehicle.position[1]) < 1 and vehicle is not self.vehicle]
-        return any(self.place < vehicle.position[0] < end + self.MARGIN * vehicle.speed for vehicle in others)
+        return any(self.place < vehicle.position[0] < end + self.MARGIN * vehicle.speed for vehicle in self._others_at(0))
 
     def arrived(self) -> bool:
         return bool(self.vehicle.position[0] > self.place + self.LENGTH + 15)
@@ -118,8 +117,7 @@ class LaneEnds(Street):
     def _offends(self, before: Any) -> bool:
         if not self.vehicle.position[1] > WIDTH / 2 >= before[1]:
             return False
-        others = [vehicle for vehicle in self.road.vehicles if abs(vehicle.position[1] - WIDTH) < 1 and vehicle is not self.vehicle]
-        return any(abs(vehicle.position[0] - self.vehicle.position[0]) < self.GAP for vehicle in others)
+        return any(abs(vehicle.position[0] - self.vehicle.position[0]) < self.GAP for vehicle in self._others_at(WIDTH))
 
     def _reward(self, action: Any) -> float:
         earned = super()._reward(action)
@@ -152,12 +150,13 @@ class StopSign(Street):
         return bool(self.vehicle.position[0] > self.line + 20)
 
 
-class Barrier(Street):
+class Barrier(Gate):
     """Wait at a barrier until a train has passed; in three of ten scenes it is open. For validation."""
 
     def _build(self) -> None:
         self._lane(("a", "b"), (0, 0), (200, 0))
         self.place = self._uniform(45, 60)
+        self.line = self.place - 8
         self._lane(("c", "d"), (self.place, -300), (self.place, 300))
         self._ego(("a", "b", 0), 0, 8)
         at, speed = 300 - self._uniform(20, 90), self._uniform(12, 16)
@@ -167,16 +166,10 @@ class Barrier(Street):
             self.train.append(self.road.vehicles[-1])
             at -= 9
         if self.train:
-            self.road.vehicles.append(Sign.make_on_lane(self.road, ("a", "b", 0), self.place - 8, 0))
+            self.road.vehicles.append(Sign.make_on_lane(self.road, ("a", "b", 0), self.line, 0))
 
-    def _simulate(self, action: Any = None) -> None:
-        super()._simulate(action)
-        if all(vehicle.position[1] > 5 for vehicle in self.train):
-            self.road.vehicles = [vehicle for vehicle in self.road.vehicles if not isinstance(vehicle, Sign)]
-
-    def _offends(self, before: Any) -> bool:
-        closed = any(isinstance(vehicle, Sign) for vehicle in self.road.vehicles)
-        return bool(closed and before[0] < self.place - 9 <= self.vehicle.position[0])
+    def _open(self) -> bool:
+        return all(vehicle.position[1] > 5 for vehicle in self.train)
 
     def arrived(self) -> bool:
         return bool(self.vehicle.position[0] > self.place + 15)

@@ -113,11 +113,34 @@ class Street(AbstractEnv, ABC):
         vehicle.target_speed, vehicle.enable_lane_change = speed, False
         self.road.vehicles.append(vehicle)
 
+    def _others_at(self, y: float) -> list[Any]:
+        """Other vehicles on the lane at ``y``, which is parallel to x."""
+        return [vehicle for vehicle in self.road.vehicles if abs(vehicle.position[1] - y) < 1 and vehicle is not self.vehicle]
+
     def _uniform(self, low: float, high: float) -> float:
         return float(self.np_random.uniform(low, high))
 
 
-class RedLight(Street):
+class Gate(Street):
+    """Street with signs at x = ``line`` that are removed when it is open; to pass them is an offence."""
+
+    line: float
+
+    @abstractmethod
+    def _open(self) -> bool:
+        """Whether it is open from now on."""
+
+    def _simulate(self, action: Any = None) -> None:
+        super()._simulate(action)
+        if self._open():
+            self.road.vehicles = [vehicle for vehicle in self.road.vehicles if not isinstance(vehicle, Sign)]
+
+    def _offends(self, before: Any) -> bool:
+        closed = any(isinstance(vehicle, Sign) for vehicle in self.road.vehicles)
+        return bool(closed and before[0] < self.line - 1 <= self.vehicle.position[0])
+
+
+class RedLight(Gate):
     """Stop at a red light until it is green; in three of ten scenes it is green from the beginning."""
 
     def _build(self) -> None:
@@ -134,14 +157,8 @@ class RedLight(Street):
         if self.green > 0:
             self.road.vehicles += [Sign.make_on_lane(self.road, ("a", "b", number), self.line, 0) for number in range(2)]
 
-    def _simulate(self, action: Any = None) -> None:
-        super()._simulate(action)
-        if self.time >= self.green:
-            self.road.vehicles = [vehicle for vehicle in self.road.vehicles if not isinstance(vehicle, Sign)]
-
-    def _offends(self, before: Any) -> bool:
-        red = any(isinstance(vehicle, Sign) for vehicle in self.road.vehicles)
-        return bool(red and before[0] < self.line - 1 <= self.vehicle.position[0])
+    def _open(self) -> bool:
+        return bool(self.time >= self.green)
 
     def arrived(self) -> bool:
         return bool(self.vehicle.position[0] > self.line + 30)
@@ -203,8 +220,7 @@ class Ramp(Street):
     def _offends(self, before: Any) -> bool:
         if not self.vehicle.position[1] < WIDTH / 2 <= before[1]:
             return False
-        others = [vehicle for vehicle in self.road.vehicles if abs(vehicle.position[1]) < 1 and vehicle is not self.vehicle]
-        return any(abs(vehicle.position[0] - self.vehicle.position[0]) < self.GAP for vehicle in others)
+        return any(abs(vehicle.position[0] - self.vehicle.position[0]) < self.GAP for vehicle in self._others_at(0))
 
     def _reward(self, action: Any) -> float:
         earned = super()._reward(action)
