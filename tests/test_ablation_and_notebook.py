@@ -160,7 +160,7 @@ CANNOT: list[tuple[dict[str, Any], str]] = [
         "expected a model of agent (in-context), found one of agent (diffusion)",
     ),
     (DRIVING | {"each": {"method": ["telepathy"]}}, "telepathy/driving.yaml: expected a configuration file, found nothing"),
-    (DRIVING | {"each": {"method": ["telepathy"]}}, "holds ablation, agent.yaml, bc, cvae"),
+    (DRIVING | {"each": {"method": ["telepathy"]}}, "holds ablation, agent.yaml, bc"),
     (DRIVING | {"each": {"method": ["bc"]}}, "models/bc/config.json: expected a pretrained model"),
 ]
 """Stages of a cell that cannot run, with a part of what is told."""
