@@ -23,7 +23,7 @@ from ftl_lightning.igm.explanation import explain
 from ftl_lightning.igm.forms.modes import Modes
 from ftl_lightning.services.errors import LONGEST, UserError
 from ftl_lightning.services.randomness import generator
-from ftl_lightning.services.shipped import list_models
+from ftl_lightning.services.shipped import TOPICS, list_models, pretrained_folder
 from ftl_lightning.training.checks import longer_than_plans
 from tests.conftest import python
 from tests.test_mistakes import refusal
@@ -73,6 +73,8 @@ def test_the_package_shows_what_it_offers_before_anything_is_imported_and_its_mo
     assert {"agent", "driving", "object_rearrangement"} <= set(list_models())
     assert not any("/" in name for name in list_models())
     assert {"baseline/bc/agent", *list_models()} <= set(list_models(baselines=True))
+    for topic, name in TOPICS.items():
+        assert (pretrained_folder(topic) / "config.json").samefile(pretrained_folder(name) / "config.json")
     assert FewShot.from_pretrained("baseline/bc/object_rearrangement").domain.name == "object_rearrangement"
 
 

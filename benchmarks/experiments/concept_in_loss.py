@@ -17,6 +17,7 @@ from ftl_lightning import FewShot
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.model import Draws
+from ftl_lightning.igm.settings import Loss
 from ftl_lightning.services.randomness import generator
 from ftl_lightning.services.tensor_file import write_text
 from ftl_lightning.training.concept_model import ConceptModel
@@ -44,7 +45,7 @@ def losses(model: ConceptModel, shown: Demonstrations, t: int) -> dict[str, floa
         draws = Draws(torch.full_like(draws.t, t).to(device), draws.noise.to(device))
         states, observed = states.to(device), {name: value.to(device) for name, value in observed.items()}
         each = {
-            name: model.losses(states, observed, together(concept), draws, "epsilon")[0]
+            name: model.losses(states, observed, together(concept), draws, Loss())[0]
             for name, concept in zip(("none", *texts), (model.empty, *model.training_embeddings), strict=True)
         }
         found["right"].append(each[text])

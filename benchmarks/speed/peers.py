@@ -42,7 +42,7 @@ from ftl_lightning.few_shot.tuned import ModelSettings
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.inversion import invert
 from ftl_lightning.igm.samplers import Sampling
-from ftl_lightning.igm.settings import InversionSettings
+from ftl_lightning.igm.settings import InversionSettings, Loss
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.services.progress import bar
 from ftl_lightning.services.randomness import generator
@@ -187,7 +187,7 @@ def loss_of(model: GenerativeModel, own: Demonstrations, learned: Composition) -
     rows = torch.arange(JUDGED) % len(own)
     together = Composition(learned.embeddings[None], learned.weights[None])
     draws = model.draws(JUDGED, 1.0, generator("cpu", 7))
-    return float(model.losses(own.states[rows], {}, together, draws, "epsilon").mean())
+    return float(model.losses(own.states[rows], {}, together, draws, Loss()).mean())
 
 
 class Timed(NamedTuple):

@@ -13,6 +13,7 @@ from ftl_lightning.igm.diffusion import Context
 from ftl_lightning.igm.guidance import composed_epsilon
 from ftl_lightning.igm.model import Draws
 from ftl_lightning.igm.samplers import Sampling
+from ftl_lightning.igm.settings import Loss
 from ftl_lightning.networks import MLPDenoiser
 from ftl_lightning.training.concept_model import TextConceptModel
 from ftl_lightning.training.data import Batch, PretrainingData
@@ -51,7 +52,7 @@ class FlowModel(TextConceptModel):
         noise = torch.randn((samples, self.config.horizon, self.config.state_dim), generator=draw, device=draw.device)
         return Draws(torch.randint(TIMES, (samples,), generator=draw, device=draw.device), noise)
 
-    def losses(self, states: Tensor, observed: Observed, composition: Composition, draws: Draws | None, loss: str) -> Tensor:
+    def losses(self, states: Tensor, observed: Observed, composition: Composition, draws: Draws | None, loss: Loss) -> Tensor:
         runs, (t, noise) = len(composition.weights), draws or self.draws(len(states), 1, torch.Generator())
         velocity = self.composed(composition, self.network.observe(self.vector(observed)))
         clean = self.encode(states, observed)

@@ -129,6 +129,8 @@ class Evaluator(pl.Callback):
 
     def _acted(self, module: Evaluable, judged: Sequence[TaskResult], episodes: int) -> list[TaskResult]:
         """The first ``episodes`` of each task, executed, in the domain's environment or in that of the user."""
+        if not judged:
+            return []
         if self.environment is not None:
             compositions = [known for behaviour in judged if (known := module.composition(behaviour.task)) is not None]
             place = Place(self.environment, self.success, episodes)

@@ -75,6 +75,10 @@ HASH_VERSION = 2
 ``benchmarks/making/rehash.py``."""
 
 
+NEWER = {"discount": 1.0}
+"""Options that are younger than the first results, with the value that has no effect and is not part of a configuration."""
+
+
 def public(hparams: Mapping[str, Any]) -> dict[str, Any]:
     """Hyper-parameters without the private keys of Lightning's command line."""
     return {key: value for key, value in hparams.items() if not key.startswith("_")}
@@ -97,7 +101,7 @@ def configuration(
     domain, model, options = module.model.domain, public(module.hparams), public(data.hparams)
     files = {key: options[key] and _identity(options[key]) for key in ("demonstrations", "more") if key in options}
     groups: dict[str, Mapping[str, Any]] = {
-        "model": {key: value for key, value in model.items() if key not in ("pretrained", "output")},
+        "model": {key: value for key, value in model.items() if key not in ("pretrained", "output") and NEWER.get(key) != value},
         "data": {key: value for key, value in options.items() if key not in ("domain", "root", "check")} | files,
         "evaluation": settings,
         "trainer": getattr(trainer, "unusual", {}) if "pretrained" in model else {},

@@ -96,7 +96,7 @@ class FewShot(Shown):
         """Load a model.
 
         Args:
-            name: a shipped model (``'agent'``, ``'driving'``, ``'object_rearrangement'``), a folder, or ``'owner/name'`` on the
+            name: a shipped model (``'navigation'``, ``'driving'``, ``'rearrangement'``), a folder, or ``'owner/name'`` on the
                 Hugging Face Hub, which needs a network.
             settings: configuration file of ``invert`` with the settings; ``None`` for that of the model's domain.
             device: device to compute on.

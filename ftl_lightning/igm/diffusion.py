@@ -98,16 +98,19 @@ def denoising_loss(
         clean, noise: ``x_0`` and eps ``(batch, horizon, state)``.
         t: timesteps ``(batch,)`` int64.
         alpha_bar: schedule ``(T,)``.
-        discount: state k of a plan has weight ``discount ** k``, normalised to mean 1 (Janner et al., 2022).
+        discount: see :func:`state_weights` (Janner et al., 2022).
 
     Returns:
         ``(batch,)``, the mean over the states of a plan and their columns.
     """
     squared = (epsilon(add_noise(clean, noise, alpha_bar[t]), t) - noise).square()
-    if discount != 1:
-        weights = discount ** torch.arange(clean.shape[1], device=clean.device)
-        squared = squared * (weights / weights.mean())[:, None]
-    return squared.mean(dim=(1, 2))
+    return (squared * state_weights(discount, clean)).mean(dim=(1, 2))
+
+
+def state_weights(discount: float, clean: Tensor) -> Tensor:
+    """Weights ``discount ** k`` of the states of plans ``(batch, horizon, state)``, with mean 1: ``(horizon, 1)``."""
+    weights = discount ** torch.arange(clean.shape[1], device=clean.device)[:, None]
+    return weights / weights.mean()
 
 
 def loss_weights(kind: str, alpha_bar: Tensor) -> Tensor:

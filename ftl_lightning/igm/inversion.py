@@ -277,7 +277,7 @@ class Inversion(nn.Module):
         starts = torch.rand(samples, generator=draw, device=embeddings.device).cpu().repeat(len(runs))
         states, observed = self.model.windows(self.demonstrations, rows, starts, draw)
         composition = self._composition(embeddings, weights, runs)
-        return self.model.losses(states, observed, composition, draws, self.settings.loss.kind)
+        return self.model.losses(states, observed, composition, draws, self.settings.loss)
 
     def step_losses(self, step: int) -> Tensor:
         """Mean losses ``(active run,)`` of gradient step ``step``, numbered from 0; modes come last.
@@ -350,8 +350,7 @@ class Inversion(nn.Module):
         auto = self.settings.modes.sets == "auto"
         empty = self._final(parameters, torch.zeros_like(weights)) if auto else losses
         embeddings, kind = self.scale_off_span(parameters), "learned" if self.settings.omega == "learned" else "fixed"
-        if kind == "learned":
-            weights = weights * self.settings.weights.scale
+        weights = weights * (self.settings.weights.scale if kind == "learned" else 1.0)
         concepts, pretrained = {}, self.model.hash
         for index, name in enumerate(self.concepts):
             single, *modes = [run for run in best.tolist() if self.runs[run].concept == index]

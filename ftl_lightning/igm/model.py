@@ -12,10 +12,10 @@ from ftl_lightning.data.features import Observed
 from ftl_lightning.data.places import Places
 from ftl_lightning.igm.composition import Composition, batched
 from ftl_lightning.igm.concept import Origin
-from ftl_lightning.igm.diffusion import Context, add_noise, denoising_loss, loss_weights, timesteps
+from ftl_lightning.igm.diffusion import Context, add_noise, denoising_loss, loss_weights, state_weights, timesteps
 from ftl_lightning.igm.guidance import branches, composed_epsilon
 from ftl_lightning.igm.samplers import Sampling
-from ftl_lightning.igm.settings import InversionSettings
+from ftl_lightning.igm.settings import InversionSettings, Loss
 
 
 class Draws(NamedTuple):
@@ -89,14 +89,12 @@ class Invertible(Protocol):
         ``share (row,)`` in [0, 1) is the relative start of each window, see ``Demonstrations.starts``.
         """
 
-    def losses(self, states: Tensor, observed: Observed, composition: Composition, draws: Draws | None, loss: str) -> Tensor:
+    def losses(self, states: Tensor, observed: Observed, composition: Composition, draws: Draws | None, loss: Loss) -> Tensor:
         """Loss of Eq. 2 ``(run, sample)`` of windows ``(run * sample, window, state)`` under compositions ``(run, K, ...)``."""
 
-    def products(self, states: Tensor, observed: Observed, frames: Tensor | None, draws: Draws | None, loss: str) -> Tensor | None:
-        """Inner products of the branches of all N training concepts, see :meth:`DiffusionModel.branch_products`.
-
-        ``(sample, 1 + N, 1 + N)`` for windows ``(sample, window, state)`` and ``frames (1, place, window)``; ``None`` for a model
-        without a composed denoiser.
+    def products(self, states: Tensor, observed: Observed, frames: Tensor | None, draws: Draws | None, loss: Loss) -> Tensor | None:
+        """Products ``(sample, 1 + N, 1 + N)``, see :meth:`DiffusionModel.branch_products`, for windows ``(sample, window, state)``
+        and ``frames (1, place, window)``; ``None`` for a model without a composed denoiser.
         """
 
     def sample(
@@ -146,7 +144,7 @@ class DiffusionModel(nn.Module):
         t = timesteps(u, len(self.alpha_bar), timestep_power)[torch.randperm(samples, generator=draw, device=device)]
         return Draws(t, torch.randn((samples, *self.plan), generator=draw, device=device))
 
-    def composed_losses(self, clean: Tensor, context: Context, composition: Composition, draws: Draws, loss: str) -> Tensor:
+    def composed_losses(self, clean: Tensor, context: Context, composition: Composition, draws: Draws, loss: Loss) -> Tensor:
         """Loss of Eq. 2 ``(run, sample)``.
 
         Args:
@@ -154,7 +152,7 @@ class DiffusionModel(nn.Module):
             context: encoded observed features of each plan.
             composition: batch of compositions, one per run: weights ``(run, K)``.
             draws: timesteps and noise of the samples, the same for all runs.
-            loss: quantity whose squared error is the loss, see :func:`~ftl_lightning.igm.diffusion.loss_weights`.
+            loss: target of the squared error, and weights of the states.
         """
         runs = len(composition.embeddings)
         losses = denoising_loss(
@@ -163,11 +161,12 @@ class DiffusionModel(nn.Module):
             draws.noise.repeat(runs, 1, 1),
             draws.t.repeat(runs),
             self.alpha_bar,
+            loss.discount,
         )
-        return losses.unflatten(0, (runs, -1)) * loss_weights(loss, self.alpha_bar)[draws.t]
+        return losses.unflatten(0, (runs, -1)) * loss_weights(loss.kind, self.alpha_bar)[draws.t]
 
     @torch.no_grad()
-    def branch_products(self, clean: Tensor, context: Context, embeddings: Tensor, draws: Draws, loss: str) -> Tensor:
+    def branch_products(self, clean: Tensor, context: Context, embeddings: Tensor, draws: Draws, loss: Loss) -> Tensor:
         """Inner products of the error of the unconditional branch and of what N embeddings add to that branch (Eq. 2).
 
         The loss of a combination with weights w is ``|e - sum_k w_k d_k|^2``, where ``e = eps - eps(x, empty)`` and
@@ -187,8 +186,8 @@ class DiffusionModel(nn.Module):
         index = torch.arange(len(concepts), device=x.device)[:, None].expand(-1, len(x))
         estimates = branches(self.denoiser, x, draws.t, concepts, index, context)
         parts = torch.cat((draws.noise[None], estimates[1:])) - estimates[0]
-        flat = parts.flatten(2).transpose(0, 1)  # (sample, 1 + N, number)
-        return flat @ flat.mT / flat.shape[2] * loss_weights(loss, self.alpha_bar)[draws.t][:, None, None]
+        flat = (parts * state_weights(loss.discount, clean).sqrt()).flatten(2).transpose(0, 1)  # (sample, 1 + N, number)
+        return flat @ flat.mT / flat.shape[2] * loss_weights(loss.kind, self.alpha_bar)[draws.t][:, None, None]
 
     def composed_plans(
         self,

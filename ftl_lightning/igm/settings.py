@@ -52,6 +52,7 @@ INVERSION: Mapping[str, str] = {
     "adapter_scope": "adapter.scope",
     "loss": "loss.kind",
     "timestep_power": "loss.timestep_power",
+    "discount": "loss.discount",
     "training_omega": "weights.training",
 }
 """Grouped options ``'group.option'`` by their flat names in results, checkpoints and the Python API."""
@@ -192,7 +193,7 @@ class BudgetOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class LossOptions:
+class Loss:
     """Training loss.
 
     Attributes:
@@ -201,14 +202,17 @@ class LossOptions:
         timestep_power: timesteps are drawn as T (1 - u^power), u uniform in [0, 1). 1 (the paper's) is uniform; with 3 half of them
             fall in the noisiest eighth. There the concept alone decides; at low noise the plan reveals the goal, so the
             unconditional loss is already low: a local minimum.
+        discount: state k of a window has weight ``discount ** k``; use values below 1 with replanning. 1 is the paper's.
     """
 
     kind: str = "epsilon"
     timestep_power: float = 1.0
+    discount: float = 1.0
 
     def __post_init__(self) -> None:
         require(self.kind in LOSSES, "model.loss.kind", f"one of {', '.join(LOSSES)}", repr(self.kind))
         check_factor("model.loss.timestep_power", self.timestep_power, 1, LARGEST_POWER)
+        check_range("model.loss.discount", self.discount, 0, 1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -239,7 +243,7 @@ class InversionSettings:
     modes: ModeOptions = field(default_factory=ModeOptions)
     adapter: AdapterOptions = field(default_factory=AdapterOptions)
     budget: BudgetOptions = field(default_factory=BudgetOptions)
-    loss: LossOptions = field(default_factory=LossOptions)
+    loss: Loss = field(default_factory=Loss)
     seed: int = 0
     form: str = UNSAID
 
@@ -277,7 +281,7 @@ GROUPS: Mapping[str, type] = MappingProxyType(
         "modes": ModeOptions,
         "adapter": AdapterOptions,
         "budget": BudgetOptions,
-        "loss": LossOptions,
+        "loss": Loss,
     }
 )
 """Option groups by name."""

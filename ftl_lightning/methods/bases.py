@@ -11,6 +11,7 @@ from torch import Tensor
 from ftl_lightning.data.features import READ, Observed
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.model import Draws
+from ftl_lightning.igm.settings import Loss
 from ftl_lightning.services.errors import require
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.method import class_path
@@ -35,7 +36,7 @@ class AdditiveModel(ConceptModel):
             concepts: ``(batch, n)``.
         """
 
-    def losses(self, states: Tensor, observed: Observed, composition: Composition, draws: Draws | None, loss: str) -> Tensor:
+    def losses(self, states: Tensor, observed: Observed, composition: Composition, draws: Draws | None, loss: Loss) -> Tensor:
         runs, each = len(composition.weights), added(composition)
         errors = self.errors(states, observed, each.repeat_interleave(len(states) // runs, dim=0))
         require(errors.shape == (len(states),), f"{class_path(type(self))}.errors", f"errors ({len(states)},)", tuple(errors.shape))

@@ -14,6 +14,8 @@ CONFIGURATIONS = _PACKAGE / "conf"
 """Folder of the shipped configuration files."""
 MODELS = _PACKAGE / "pretrained"
 """Folder of the shipped models."""
+TOPICS: Mapping[str, str] = {"motion": "mocap", "navigation": "agent", "rearrangement": "object_rearrangement"}
+"""Shipped models by topic, where their domain has another name."""
 FILM = Path(__file__).parent / "film.js"
 """Script that draws films on a page. It contains ``"use strict"``, so it must be the first script."""
 
@@ -43,7 +45,7 @@ def missing_model(place: str | Path) -> str:
     """Error message for ``place`` without a model, with the nearest shipped names."""
     place = short(str(place), 80)
     normalised = place.lower().replace(" ", "_").replace("-", "_").removeprefix("pretrained/")
-    near = difflib.get_close_matches(normalised, list_models(baselines=True), n=2)
+    near = difflib.get_close_matches(normalised, [*list_models(baselines=True), *TOPICS], n=2)
     ship = f"did you mean {' or '.join(near)}? shipped models:" if near else f"{', '.join(shipped_models())} ship, see"
     return (
         f"{Path(place) / 'config.json'}: expected a pretrained model, found nothing; {ship} ftl_lightning.list_models(); "
@@ -52,8 +54,8 @@ def missing_model(place: str | Path) -> str:
 
 
 def pretrained_folder(name: str | Path) -> Path:
-    """Folder of a pretrained model by its path or shipped name, such as ``agent``."""
-    for path in (Path(name), shipped(name), shipped(Path("pretrained") / name)):
+    """Folder of a pretrained model by its path, shipped name or topic, such as ``agent`` or ``navigation``."""
+    for path in (Path(name), shipped(name), shipped(Path("pretrained") / TOPICS.get(str(name), name))):
         if (path / "config.json").is_file():
             return path
     return Path(name)

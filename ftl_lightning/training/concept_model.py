@@ -21,7 +21,7 @@ from ftl_lightning.igm.forms.choice import learn
 from ftl_lightning.igm.inversion import Inversion, Tell, Watch
 from ftl_lightning.igm.model import Draws
 from ftl_lightning.igm.samplers import Sampling
-from ftl_lightning.igm.settings import ADAPTED, AUTO, MIXED, MODES, NOT_LEARNED, ONE, PAPER, InversionSettings
+from ftl_lightning.igm.settings import ADAPTED, AUTO, MIXED, MODES, NOT_LEARNED, ONE, PAPER, InversionSettings, Loss
 from ftl_lightning.networks.image_encoder import ImageEncoders
 from ftl_lightning.services.errors import UserError, require, short, shown
 from ftl_lightning.services.randomness import drawn
@@ -221,7 +221,7 @@ class ConceptModel(Shown, nn.Module, ABC):
         states, observed = demonstrations.windows(rows, starts, self.window)
         return self.perturbed(states.to(self.device), moved(observed, self.device), draw)
 
-    def losses(self, states: Tensor, observed: Observed, composition: Composition, draws: Draws | None, loss: str) -> Tensor:
+    def losses(self, states: Tensor, observed: Observed, composition: Composition, draws: Draws | None, loss: Loss) -> Tensor:
         """Losses ``(run, sample)`` of behaviour under concepts, for inversion by gradient descent.
 
         Args:
@@ -229,11 +229,11 @@ class ConceptModel(Shown, nn.Module, ABC):
             observed: features ``(run * sample, *shape)`` by name.
             composition: ``(run, K, ...)``.
             draws: result of :meth:`draws`.
-            loss: target of a diffusion model's squared error.
+            loss: target of a diffusion model's squared error, and weights of the states.
         """
         raise NotImplementedError(f"{type(self).__name__}: an invertible model defines losses")
 
-    def products(self, states: Tensor, observed: Observed, frames: Tensor | None, draws: Draws | None, loss: str) -> Tensor | None:
+    def products(self, states: Tensor, observed: Observed, frames: Tensor | None, draws: Draws | None, loss: Loss) -> Tensor | None:
         """Inner products of the branches of all training concepts; ``None`` for a model without a composed denoiser.
 
         See :meth:`ftl_lightning.igm.model.DiffusionModel.branch_products`.

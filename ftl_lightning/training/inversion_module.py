@@ -23,7 +23,7 @@ from ftl_lightning.igm.settings import (
     BudgetOptions,
     EmbeddingOptions,
     InversionSettings,
-    LossOptions,
+    Loss,
     ModeOptions,
     WeightOptions,
 )
@@ -70,7 +70,7 @@ class InversionModule(Adaptation):
         modes: ModeOptions = _USUAL.modes,
         adapter: AdapterOptions = _USUAL.adapter,
         budget: BudgetOptions = _USUAL.budget,
-        loss: LossOptions = _USUAL.loss,
+        loss: Loss = _USUAL.loss,
         output: str | None = None,
         seed: int = 0,
         form: str = "",

@@ -15,6 +15,7 @@ from ftl_lightning.domains.driving.environment import DrivingEnvironment
 from ftl_lightning.domains.driving.scenarios import SCENARIOS, advance, arrived, make, observe, restore, save
 from ftl_lightning.domains.driving.traffic import (
     BARRIER,
+    FIRST_EXIT,
     NAMES,
     OBSERVED,
     PRACTICE,
@@ -415,6 +416,6 @@ def test_constant_decisions_fail_in_half_of_the_scenes_or_more(name: str) -> Non
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [*RULES, *PRACTICE, BARRIER])
+@pytest.mark.parametrize("name", [*RULES, *PRACTICE, BARRIER, FIRST_EXIT])
 def test_the_expert_keeps_the_rules(name: str) -> None:
     assert expert.drive(name, 0)[1]

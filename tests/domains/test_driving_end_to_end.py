@@ -135,7 +135,7 @@ def test_generate_writes_what_invert_reads() -> None:
 def test_mistakes_and_a_file_whose_states_do_not_fit(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(UserError, match=r"data.samples_per_concept: expected at most 100 episodes"):
         training_set("train", 101)
-    with pytest.raises(UserError, match=r"model.view: expected one of '', 'map', 'steps'"):
+    with pytest.raises(UserError, match=r"model.view: expected one of '', 'map', 'steps', 'standing'"):
         find_view(DOMAIN, "mirror")
     config = read_model(GenerativeModel, ROOT / "pretrained" / "driving").config
     with pytest.raises(UserError, match=r"model.perturb: expected a view that can"):

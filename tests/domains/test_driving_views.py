@@ -133,9 +133,10 @@ def test_in_steps_every_state_of_a_straight_drive_is_the_same_and_a_heading_is_o
 
 def test_no_model_sees_which_new_road_it_is_or_the_seed_and_entities_are_the_other_vehicles() -> None:
     start, other = scene(), scene(number=5)
-    for view in VIEWS.values():
-        assert {name: feature.shape for name, feature in view.features.items()} == {TRAFFIC: (35,)}
-        assert seen_in(start, view).shape == (1, 35)
+    for name, view in VIEWS.items():
+        width = 40 if name == "standing" else 35
+        assert {name: feature.shape for name, feature in view.features.items()} == {TRAFFIC: (width,)}
+        assert seen_in(start, view).shape == (1, width)
         assert torch.equal(seen_in(start, view), seen_in(other, view))
     # The seed is part of a scene, of which nothing but what is observed reaches a model.
     assert sum(feature.size for feature in DOMAIN.observed.values()) == 36
@@ -158,3 +159,10 @@ def test_a_drive_is_the_same_on_any_road_and_a_plan_is_followed_by_its_drives() 
     plans = straight_on(2.0)
     for step in (0, 3, 20):  # its last once it is at its end
         assert act(plans, step, scene(2.0))[0].tolist() == pytest.approx([8, 0, 8, 0], abs=1e-4)
+
+
+def test_standing_vehicles_are_resolved_and_absent_ones_are_not_seen() -> None:
+    start, view = scene(2.0, 80, -20, KNOWN), VIEWS["standing"]
+    torch.testing.assert_close(seen_in(start, view)[:, :-5], seen_in(start))
+    torch.testing.assert_close(seen_in(start, view)[0, -5:], torch.tensor([math.exp(-8), math.exp(-4), 0, 0, 0]))
+    assert view.features[TRAFFIC].entities[0][-1] == len(seen_in(start)[0]) + 1

@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -278,6 +279,11 @@ def test_the_rate_of_each_step_is_a_curve_and_so_is_the_loss_of_an_inversion(tin
     assert max(rates) > rates[-1] > 0  # cosine decay
     events = EventAccumulator(str(invert("--trainer.log_every_n_steps=1", "--evaluation.suites=[]"))).Reload()
     assert [event.step for event in events.Scalars("loss/train")] == [1, 2, 3, 4, 5]
+
+
+def test_without_suites_no_episode_is_executed() -> None:
+    module = SimpleNamespace(domain=load_domain("driving"))
+    assert Evaluator(suites=[], closed_loop=True)._acted(module, [], 1) == []  # type: ignore[arg-type]
 
 
 def test_demonstrations_are_drawn_above_the_samples_that_are_framed_by_outcome(tiny: Path) -> None:

@@ -24,7 +24,7 @@ from ftl_lightning.igm.explanation import formula
 from ftl_lightning.igm.forms.combination import Combination
 from ftl_lightning.igm.forms.skill import Drawn, LeftOut
 from ftl_lightning.igm.samplers import SAMPLERS, Sampling
-from ftl_lightning.igm.settings import ADAPTED, COMBINED, NOT_LEARNED, ONE, VARIATION, InversionSettings
+from ftl_lightning.igm.settings import ADAPTED, COMBINED, NOT_LEARNED, ONE, VARIATION, InversionSettings, Loss
 from ftl_lightning.methods.ftl_igm.model import DiffusionConfig, GenerativeModel
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.training.model_config import Prepared
@@ -86,10 +86,10 @@ def test_the_loss_of_a_combination_is_the_quadratic_function_of_its_weights(mode
     draw = torch.Generator().manual_seed(1)
     draws = net.draws(6, 1.0, draw)
     states, observed = net.windows(few, torch.zeros(6, dtype=torch.int64), torch.zeros(6), draw)
-    products = net.products(states, observed, None, draws, "clean")
+    products = net.products(states, observed, None, draws, Loss(kind="clean"))
     weights = torch.tensor([0.7, -0.4, 1.3])
     composition = Composition(net.training_embeddings[None, :, None], weights[None])
-    direct = net.losses(states, observed, composition, draws, "clean")[0]
+    direct = net.losses(states, observed, composition, draws, Loss(kind="clean"))[0]
     linear, square = products[:, 0, 1:] @ weights, torch.einsum("i,sij,j->s", weights, products[:, 1:, 1:], weights)
     torch.testing.assert_close(products[:, 0, 0] - 2 * linear + square, direct, rtol=1e-4, atol=1e-5)
 

@@ -6,6 +6,7 @@ from torch import Tensor
 
 from ftl_lightning import FewShot
 from ftl_lightning.evaluation.generation import Generation, generate, tasks_of
+from ftl_lightning.igm.settings import Loss
 from ftl_lightning.methods.bc import CloningModel
 from ftl_lightning.services.errors import UserError
 
@@ -14,7 +15,7 @@ def test_errors_have_one_number_for_each_window(monkeypatch: pytest.MonkeyPatch)
     model = FewShot.from_pretrained("baseline/bc/object_rearrangement")
     monkeypatch.setattr(CloningModel, "errors", lambda self, states, observed, concepts: torch.zeros(()))
     with pytest.raises(UserError, match=r"methods\.bc\.CloningModel\.errors: expected errors \(4,\), found \(\)"):
-        model.model.losses(torch.zeros(4, 1, 9), {}, model.model.compositions(slice(0, 1)), None, "clean")
+        model.model.losses(torch.zeros(4, 1, 9), {}, model.model.compositions(slice(0, 1)), None, Loss(kind="clean"))
 
 
 def test_samples_have_a_dimension_of_compositions(monkeypatch: pytest.MonkeyPatch) -> None:

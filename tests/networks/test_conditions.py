@@ -16,6 +16,7 @@ from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.evaluation.closed_loop import sampled_plans
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.samplers import Sampling
+from ftl_lightning.igm.settings import Loss
 from ftl_lightning.methods.ftl_igm.model import DiffusionConfig, GenerativeModel
 from ftl_lightning.networks.conditions import CHOSEN, ENCODERS, EntityEncoder, PointEncoder, Sizes, condition_encoder
 from ftl_lightning.networks.mlp import MLPDenoiser
@@ -86,7 +87,7 @@ def test_learning_reads_it_once_a_step_for_all_branches(calls: dict[str, list[in
     concepts = torch.randn(2, 3, 1, 6, requires_grad=True)
     draws = net.draws(4, 1.0, generator("cpu", 0))
     seen = {OBSERVED: scenes("go to bowl", 8, 0)}
-    losses = net.losses(torch.zeros(8, 8, 13), seen, Composition(concepts, torch.ones(2, 3)), draws, "epsilon")
+    losses = net.losses(torch.zeros(8, 8, 13), seen, Composition(concepts, torch.ones(2, 3)), draws, Loss(kind="epsilon"))
     assert losses.shape == (2, 4)
     assert calls["observe"] == [8]
     assert calls["attend"] == [8, 3 * 8]

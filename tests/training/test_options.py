@@ -15,7 +15,7 @@ from ftl_lightning.igm.settings import (
     INVERSION,
     BudgetOptions,
     InversionSettings,
-    LossOptions,
+    Loss,
     ModeOptions,
 )
 from ftl_lightning.methods.ftl_igm import pretraining
@@ -77,7 +77,7 @@ def test_options_go_from_flat_names_into_groups_and_back() -> None:
         samples=5, restarts=2, screening=3, learning_rate=0.02, tolerance=0.3, precision="bf16-mixed"
     )
     assert settings.modes == ModeOptions(sets="each", samples=6)
-    assert settings.loss == LossOptions(kind="v", timestep_power=2.0)
+    assert settings.loss == Loss(kind="v", timestep_power=2.0)
     usual = InversionSettings()
     assert usual.changed(**flat(of_groups(usual), INVERSION)) == usual
     assert all(value != flat(of_groups(usual), INVERSION)[name] for name, value in OTHER.items() if name != "adapter")

@@ -35,6 +35,7 @@ from ftl_lightning.domains.driving.views import speed
 from ftl_lightning.domains.execution import Policy
 from ftl_lightning.evaluation.closed_loop import PlanFollower, planner, sampled_plans
 from ftl_lightning.igm.composition import Composition
+from ftl_lightning.igm.settings import Loss
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.networks.text_encoder import load_encoder
 from ftl_lightning.services.progress import bar
@@ -70,7 +71,7 @@ def held_out_loss(model: ConceptModel, concept: Composition, drives: Demonstrati
     states, observed = drives.windows(rows, starts, model.window)
     draws = model.draws(len(rows), 1.0, generator("cpu", SEED))
     alone = replace(concept, embeddings=concept.embeddings[None], weights=concept.weights[None])
-    return float(model.losses(states, observed, alone, draws, "clean").mean())
+    return float(model.losses(states, observed, alone, draws, Loss(kind="clean")).mean())
 
 
 def policies(

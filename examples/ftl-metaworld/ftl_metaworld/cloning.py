@@ -20,6 +20,7 @@ from ftl_lightning.igm.forms.adapter import LowRank, adaptable, adapted
 from ftl_lightning.igm.model import Draws
 from ftl_lightning.igm.optimizer import Adam
 from ftl_lightning.igm.samplers import Sampling
+from ftl_lightning.igm.settings import Loss
 from ftl_lightning.methods.bases import added
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.networks import MLPDenoiser
@@ -75,7 +76,7 @@ class ChunkModel(TextConceptModel):
         assert vector is not None
         return network(x, torch.zeros_like(row), added(composition)[:, None], row, (vector,))
 
-    def losses(self, states: Tensor, observed: Observed, composition: Composition, draws: Draws | None, loss: str) -> Tensor:
+    def losses(self, states: Tensor, observed: Observed, composition: Composition, draws: Draws | None, loss: Loss) -> Tensor:
         runs = len(composition.weights)
         row = torch.arange(runs, device=self.device).repeat_interleave(len(states) // runs)
         errors = self.plans(observed, composition, row) - self.encode(states, observed)
@@ -198,7 +199,7 @@ class AllWeights(Adaptation):
             rows = torch.randint(len(shown), (options["samples"],), generator=draw)
             states, observed = model.windows(shown, rows, torch.rand(len(rows), generator=draw), draw)
             composition = Composition(embedding, torch.ones(1, 1))
-            mean = model.losses(states, observed, composition, model.draws(len(rows), 1.0, draw), options["loss"]).mean()
+            mean = model.losses(states, observed, composition, model.draws(len(rows), 1.0, draw), Loss(kind=options["loss"])).mean()
             for optimizer, gradient in zip(optimizers, torch.autograd.grad(mean, list(rates), materialize_grads=True), strict=True):
                 optimizer.step(gradient, step, steps)
             loss = mean.item()

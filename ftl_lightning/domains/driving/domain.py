@@ -74,17 +74,17 @@ def _nearest(goal: str, starts: InitialStates, demonstrations: Demonstrations | 
     return lambda observed, rows, step: following[torch.cdist(observed[traffic.TRAFFIC][:, : traffic.STATE], places).argmin(dim=1)]
 
 
-def _regression(fit: Callable[[Tensor, Tensor, torch.Generator], Callable[[Tensor], Tensor]]) -> Make:
-    """Predict drives ``(n, 4)`` from the models' view ``(n, 35)``; ``fit`` receives both standardised, and a generator."""
+def _regression(fit: Callable[[Tensor, Tensor, torch.Generator], Callable[[Tensor], Tensor]], view: str) -> Make:
+    """Predict drives ``(n, 4)`` from the models' view ``(n, m)``; ``fit`` receives both standardised, and a generator."""
 
     def policy(goal: str, starts: InitialStates, demonstrations: Demonstrations | None, seed: int) -> Policy:
         seen, following = _transitions(goal, demonstrations)
-        view = VIEWS["steps"].observe
-        inputs, drives = view(seen)[traffic.TRAFFIC], drive(seen[traffic.TRAFFIC][:, : traffic.STATE], following)
+        observe = VIEWS[view].observe
+        inputs, drives = observe(seen)[traffic.TRAFFIC], drive(seen[traffic.TRAFFIC][:, : traffic.STATE], following)
         middle, spread = inputs.mean(dim=0), inputs.std(dim=0).clamp(min=1e-3)
         mean, scale = drives.mean(dim=0), drives.std(dim=0).clamp(min=1e-3)
         predict = fit((inputs - middle) / spread, (drives - mean) / scale, generator("cpu", seed))
-        return lambda observed, rows, step: predict((view(observed)[traffic.TRAFFIC] - middle) / spread) * scale + mean
+        return lambda observed, rows, step: predict((observe(observed)[traffic.TRAFFIC] - middle) / spread) * scale + mean
 
     return policy
 
@@ -130,16 +130,20 @@ def _expert(goal: str, starts: InitialStates, demonstrations: Demonstrations | N
     return lambda observed, rows, step: torch.stack([drives[row][min(step + 1, len(drives[row]) - 1)] for row in rows])
 
 
-POLICIES = {
-    "IDLE": _always("IDLE"),
-    "random": _random,
-    "FASTER": _always("FASTER"),
-    "nearest demonstration": _nearest,
-    "ridge regression": _regression(_ridge),
-    "MLP regression": _regression(_mlp),
-    "expert (oracle)": _expert,
-}
-"""Baseline policies by name; all are subject to the planner's veto."""
+def policies(view: str) -> dict[str, Make]:
+    """Baseline policies by name; all are subject to the planner's veto. The regressions observe a ``view``."""
+    return {
+        "IDLE": _always("IDLE"),
+        "random": _random,
+        "FASTER": _always("FASTER"),
+        "nearest demonstration": _nearest,
+        "ridge regression": _regression(_ridge, view),
+        "MLP regression": _regression(_mlp, view),
+        "expert (oracle)": _expert,
+    }
+
+
+POLICIES = policies("steps")
 RENDERING = "ftl_lightning.domains.driving.rendering"
 
 
@@ -219,33 +223,33 @@ def distance(states: Tensor, others: Tensor) -> Tensor:
     return path_distance(path(states), path(others))
 
 
+LOOP = ClosedLoop(
+    environment=environment,
+    identity=f"{traffic.BELIEF} veto",
+    others={f"{veto} veto": partial(environment, veto) for veto in (traffic.SIMULATION, traffic.STEP)},
+    act=lambda plans, step, observed: plans[:, min(step + 1, plans.shape[1] - 1)],
+    steps=traffic.MAX_STEPS,
+    judge=judge,
+    film=deferred(f"{RENDERING}:film"),
+    vector_film=deferred(f"{RENDERING}:vector_film"),
+    less_is_better=("crash",),
+    policies=POLICIES,
+    expect=traffic.check_simulator,
+)
 DOMAIN = Domain(
     name=traffic.NAME,
     plans=Plans(traffic.HORIZON, traffic.STATE_NAMES, traffic.STATE_UNITS, resolution=1e-3, views=VIEWS),
     concepts=Concepts(
         training=traffic.TRAINING_CONCEPTS,
         suites=traffic.SUITES,
-        # Other roundabouts use the concept of the roundabout.
-        descriptions=tuple(name for name in traffic.NAMES if name not in traffic.OTHER_ROUNDABOUTS),
+        descriptions=tuple(name for name in traffic.NAMES if name not in (*traffic.OTHER_ROUNDABOUTS, traffic.FIRST_EXIT)),
         reads=traffic.NAMES.__contains__,
         table=Path(__file__).parent / "embeddings.safetensors",
     ),
     source=Expert,
     observed=traffic.FEATURES_SEEN,
     show=Show(deferred(f"{RENDERING}:render"), vector_film=deferred(f"{RENDERING}:plan_film")),
-    closed_loop=ClosedLoop(
-        environment=environment,
-        identity=f"{traffic.BELIEF} veto",
-        others={f"{veto} veto": partial(environment, veto) for veto in (traffic.SIMULATION, traffic.STEP)},
-        act=lambda plans, step, observed: plans[:, min(step + 1, plans.shape[1] - 1)],
-        steps=traffic.MAX_STEPS,
-        judge=judge,
-        film=deferred(f"{RENDERING}:film"),
-        vector_film=deferred(f"{RENDERING}:vector_film"),
-        less_is_better=("crash",),
-        policies=POLICIES,
-        expect=traffic.check_simulator,
-    ),
+    closed_loop=LOOP,
     comparison=Comparison(
         headline="closed loop strict success",
         distance=distance,
@@ -263,6 +267,7 @@ WIDE = replace(
         table=Path(__file__).parent / "wide_embeddings.safetensors",
     ),
     source=partial(Expert, wide=True),
+    closed_loop=replace(LOOP, policies=policies("standing")),
     comparison=replace(DOMAIN.comparison, paper=None),
 )
 """Driving with scenarios with rules in pretraining."""

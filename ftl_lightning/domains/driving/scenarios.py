@@ -103,6 +103,14 @@ class OtherRoundabout(_Accelerated, RoundaboutGenericEnv):
     """Take the second exit of a roundabout of another size, with vehicles on all its roads."""
 
 
+class FirstExit(Roundabout):
+    """Take the first exit of the same roundabout."""
+
+    def _make_vehicles(self) -> None:
+        super()._make_vehicles()
+        self.vehicle.plan_route_to("exs")
+
+
 class ThirdExit(Roundabout):
     """Take the third exit of the same roundabout; for validation."""
 
@@ -191,6 +199,7 @@ SCENARIOS = {
     "lane ends": _ruled(practice.LaneEnds),
     "stop sign": _ruled(practice.StopSign),
     "barrier": _ruled(practice.Barrier),
+    "roundabout first exit": Scenario(FirstExit, {"duration": 8}, _on(("ex", "exs"), ("exs", "exr")), destinations=EXITS),
 }
 
 

@@ -46,7 +46,8 @@ PRACTICE = ("stop and go", "narrow bridge", "parked car", "lane ends", "stop sig
 WIDE_CONCEPTS = (*TRAINING_CONCEPTS, *PRACTICE)
 """Training concepts of the wide model: also scenarios with rules, none of which is an evaluation task."""
 BARRIER = "barrier"
-NAMES = (*TRAINING_CONCEPTS, "roundabout", "roundabout third exit", *OTHER_ROUNDABOUTS, *RULES, *PRACTICE, BARRIER)
+FIRST_EXIT = "roundabout first exit"
+NAMES = (*TRAINING_CONCEPTS, "roundabout", "roundabout third exit", *OTHER_ROUNDABOUTS, *RULES, *PRACTICE, BARRIER, FIRST_EXIT)
 """Scenario names; scenes contain the index."""
 
 
@@ -105,6 +106,11 @@ SUITES = {
 """``validation`` is another route through the same roundabout; ``more`` and ``other roundabouts`` are not used for tuning."""
 WIDE_SUITES = SUITES | {
     "training": training_suite(WIDE_CONCEPTS),
+    "more": Suite(
+        tuple(
+            EvaluationTask("new scenario", name, learned=(name,)) for name in (*RULES, "roundabout", FIRST_EXIT, *OTHER_ROUNDABOUTS)
+        )
+    ),
     "validation": Suite((EvaluationTask("new scenario", BARRIER, learned=(BARRIER,)),)),
 }
 

@@ -1,13 +1,16 @@
 """Views of traffic: in map coordinates, or relative to the controlled vehicle."""
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
-from ftl_lightning.data.features import Observed
+from ftl_lightning.data.features import Feature, Observed
 from ftl_lightning.domains.domain import View
 from ftl_lightning.domains.driving.traffic import (
     FEATURES_SEEN,
     NAMES,
+    OBSERVED,
     SCENARIO,
     STATE,
     TRAFFIC,
@@ -79,6 +82,13 @@ def _observe_from_ego(observed: Observed) -> Observed:
     return {TRAFFIC: torch.cat((pose[:, :4], ego[:, 3:5].norm(dim=-1, keepdim=True), pose[:, 4:], relative.flatten(1)), dim=-1)}
 
 
+def _observe_standing(observed: Observed) -> Observed:
+    """As :func:`_observe_from_ego`, and ``exp(-speed)`` of each vehicle, 0 where absent ``(35 + 5)``: near 1 if it stands."""
+    vehicles = _vehicles(observed)
+    standing = torch.exp(-vehicles[..., 3:5].norm(dim=-1)) * vehicles[..., 0]
+    return {TRAFFIC: torch.cat((_observe_from_ego(observed)[TRAFFIC], standing), dim=-1)}
+
+
 def _known(observed: Observed) -> Tensor:
     """Whether the map position is known ``(sample, 1)``: the road is part of pretraining and not hidden."""
     traffic = observed[TRAFFIC]
@@ -145,6 +155,19 @@ def _perturb(states: Tensor, observed: Observed, draw: torch.Generator | None) -
     return torch.cat((now[:, None], states[:, 1:]), dim=1), {**observed, TRAFFIC: traffic}
 
 
+STEPS = View(
+    features={TRAFFIC: FEATURES_SEEN[TRAFFIC]},
+    observe=_observe_from_ego,
+    encode=_encode_steps,
+    decode=_decode_steps,
+    perturb=_perturb,
+    act=_act,
+    scales=((1, 3, 5), (2, 4, 6)),
+)
+SEEN_STANDING = Feature(
+    (OBSERVED + VEHICLES,),
+    entities=tuple((*columns, OBSERVED + number) for number, columns in enumerate(FEATURES_SEEN[TRAFFIC].entities, start=1)),
+)
 VIEWS = {
     "map": View(
         features={TRAFFIC: FEATURES_SEEN[TRAFFIC]},
@@ -152,14 +175,7 @@ VIEWS = {
         encode=lambda states, observed: states,
         decode=lambda states, observed: states,
     ),
-    "steps": View(
-        features={TRAFFIC: FEATURES_SEEN[TRAFFIC]},
-        observe=_observe_from_ego,
-        encode=_encode_steps,
-        decode=_decode_steps,
-        perturb=_perturb,
-        act=_act,
-        scales=((1, 3, 5), (2, 4, 6)),
-    ),
+    "steps": STEPS,
+    "standing": replace(STEPS, features={TRAFFIC: SEEN_STANDING}, observe=_observe_standing),
 }
-"""``map`` is the paper's view. In ``steps``, constant motion has the same encoding on any road."""
+"""``map`` is the paper's view. In ``steps``, constant motion is the same on any road; ``standing`` also resolves low speeds."""

@@ -67,7 +67,7 @@ class Combination:
             draws = model.draws(SAMPLES, settings.loss.timestep_power, draw)
             share = torch.rand(SAMPLES, generator=draw, device=model.device).cpu()
             states, observed = model.windows(demonstrations, torch.full((SAMPLES,), row), share, draw)
-            part = model.products(states, observed, frames, draws, settings.loss.kind)
+            part = model.products(states, observed, frames, draws, settings.loss)
             if part is None:
                 return None
             products.append(part.double().mean(dim=0).cpu())

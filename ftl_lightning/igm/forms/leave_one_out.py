@@ -13,7 +13,7 @@ from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.inversion import Inversion, Tell, invert
 from ftl_lightning.igm.model import Draws, Invertible
 from ftl_lightning.igm.samplers import Sampling
-from ftl_lightning.igm.settings import PAPER, InversionSettings
+from ftl_lightning.igm.settings import PAPER, InversionSettings, Loss
 from ftl_lightning.services.randomness import generator
 
 MOST = 12
@@ -41,7 +41,7 @@ class _Noised:
     """Windows ``(demo * sample, window, state)`` by demonstration, what is ``seen`` there, and noise shared by all concepts."""
 
     model: Invertible
-    kind: str
+    loss: Loss
     states: Tensor
     seen: Observed
     draws: Draws | None
@@ -58,14 +58,14 @@ class _Noised:
         share = torch.rand(samples, generator=draw, device=device).cpu().repeat(count)
         rows = torch.arange(count).repeat_interleave(samples)
         states, seen = model.windows(demonstrations, rows, share, draw)
-        return cls(model, settings.loss.kind, states, seen, draws, count)
+        return cls(model, settings.loss, states, seen, draws, count)
 
     def losses(self, concepts: Composition, states: Tensor | None = None) -> Tensor:
         """Mean losses ``(concept, demo)`` on the CPU, of the windows or of ``states`` in their place."""
         runs = len(concepts.weights)
         repeated = {name: values.repeat(runs, *[1] * (values.dim() - 1)) for name, values in self.seen.items()}
         shown = self.states.repeat(runs, 1, 1) if states is None else states
-        losses = self.model.losses(shown, repeated, concepts, self.draws, self.kind)
+        losses = self.model.losses(shown, repeated, concepts, self.draws, self.loss)
         return losses.unflatten(1, (self.demonstrations, -1)).mean(dim=2).cpu()
 
     def empty(self, concepts: Composition) -> Tensor:

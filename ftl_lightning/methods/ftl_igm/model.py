@@ -15,6 +15,7 @@ from ftl_lightning.igm.diffusion import MOST_STEPS, PREDICTIONS, Context, Predic
 from ftl_lightning.igm.forms.adapter import LowRank, adaptable
 from ftl_lightning.igm.model import DiffusionModel, Draws
 from ftl_lightning.igm.samplers import Sampling
+from ftl_lightning.igm.settings import Loss
 from ftl_lightning.services.errors import require, short
 from ftl_lightning.services.spectrum import Spectrum, check_cosines
 from ftl_lightning.services.validation import check_range, from_mapping
@@ -104,13 +105,13 @@ class GenerativeModel(DiffusionModel, TextConceptModel):
         context: Context = self.denoiser.observe(self.vector(observed))  # type: ignore[operator]
         return context
 
-    def losses(self, states: Tensor, observed: Observed, composition: Composition, draws: Draws | None, loss: str) -> Tensor:
+    def losses(self, states: Tensor, observed: Observed, composition: Composition, draws: Draws | None, loss: Loss) -> Tensor:
         assert draws is not None
         context, runs = self.observe(observed), range(len(composition.weights))
         frames = None if self.frames is None else self.frames_by_plan([composition.row(run) for run in runs], len(draws.t))
         return self.composed_losses(self.encode(states, observed, frames), context, composition, draws, loss)
 
-    def products(self, states: Tensor, observed: Observed, frames: Tensor | None, draws: Draws | None, loss: str) -> Tensor:
+    def products(self, states: Tensor, observed: Observed, frames: Tensor | None, draws: Draws | None, loss: Loss) -> Tensor:
         assert draws is not None
         clean = self.encode(states, observed, frames)
         return self.branch_products(clean, self.observe(observed), self.training_embeddings, draws, loss)
