@@ -199,7 +199,7 @@ SCENARIOS = {
     "lane ends": _ruled(practice.LaneEnds),
     "stop sign": _ruled(practice.StopSign),
     "barrier": _ruled(practice.Barrier),
-    "roundabout first exit": Scenario(FirstExit, {"duration": 8}, _on(("ex", "exs"), ("exs", "exr")), destinations=EXITS),
+    "first exit": Scenario(FirstExit, {"duration": 8}, _on(("ex", "exs"), ("exs", "exr")), destinations=EXITS),
 }
 
 

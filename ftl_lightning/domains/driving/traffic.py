@@ -46,7 +46,7 @@ PRACTICE = ("stop and go", "narrow bridge", "parked car", "lane ends", "stop sig
 WIDE_CONCEPTS = (*TRAINING_CONCEPTS, *PRACTICE)
 """Training concepts of the wide model: also scenarios with rules, none of which is an evaluation task."""
 BARRIER = "barrier"
-FIRST_EXIT = "roundabout first exit"
+FIRST_EXIT = "first exit"
 NAMES = (*TRAINING_CONCEPTS, "roundabout", "roundabout third exit", *OTHER_ROUNDABOUTS, *RULES, *PRACTICE, BARRIER, FIRST_EXIT)
 """Scenario names; scenes contain the index."""
 
