@@ -32,6 +32,7 @@ from ftl_lightning.reporting.table import (
     training_settings,
 )
 from ftl_lightning.reporting.tables import against, as_learned_most
+from ftl_lightning.services.shipped import topic
 from ftl_lightning.training.method import load_method
 
 BASELINES = tuple(load_method(name).name for name in ("bc", "cvae", "in_context", "language"))  # names of the paper's baselines
@@ -210,8 +211,8 @@ def short_overview(results: pd.DataFrame) -> Table:
         )
     brackets = _brackets(results) if any("[" in line[1] + line[2] for line in lines) else ""
     caption = (
-        f"New concepts, mean ± standard error over tasks{brackets}. {OURS}: first the paper's form of the concept; "
-        "networks, views and losses are ours. Lead: over the best or the named baseline, with its 95 % interval over tasks"
+        f"New concepts, mean ± standard error over tasks{brackets}. {OURS} (this method): the paper's form of the concept unless "
+        "named; networks, views and losses are ours. Lead: over the best baseline unless named, with its 95 % interval over tasks"
     )
     head = ["domain: setting, metric", OURS, "best baseline", "best without pretraining, oracle", "lead"]
     return make_table(None, "overview", caption, lines, head)
@@ -279,7 +280,7 @@ def _overview(results: pd.DataFrame, lines: Sequence[tuple[Domain, str, str]], c
             line.append(", ".join(f"{form} {cell}".strip() for form, cell in cell_of.items() if cell != MISSING) or MISSING)
         cells.append(line)
     head = ["domain: setting, metric", "lead", *grouped]
-    legend = f". {PAPERS_METHOD.name}: first the paper's form of the concept; guidance, networks, views and losses are ours"
+    legend = f". {PAPERS_METHOD.name}: the paper's form of the concept unless named; guidance, networks, views and losses are ours"
     caption = (
         f"Ours and the baselines, mean ± standard error over tasks{_brackets(results)}; lead: by how much ours is better than the "
         f"best baseline, with its 95 % interval over tasks{legend * (len(grouped.get(OURS, ())) > 1)}"
@@ -301,7 +302,7 @@ def _domains(results: pd.DataFrame) -> list[Domain]:
 
 
 def _subject(domain: Domain, setting: str, metric: str) -> str:
-    return f"{domain.name}: {setting}, {metric}"
+    return f"{topic(domain.name)}: {setting}, {metric}"
 
 
 def _references(domain: Domain, rows: pd.DataFrame, references: pd.DataFrame, setting: str, metric: str) -> str:

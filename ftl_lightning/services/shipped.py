@@ -41,6 +41,11 @@ def list_models(baselines: bool = False) -> list[str]:
     return shipped_models() + (others if baselines else [])
 
 
+def topic(domain: str) -> str:
+    """Topic of a domain, such as ``navigation`` of ``agent``; the domain's name without one."""
+    return next((topic for topic, name in TOPICS.items() if name == domain), domain)
+
+
 def missing_model(place: str | Path) -> str:
     """Error message for ``place`` without a model, with the nearest shipped names."""
     place = short(str(place), 80)
