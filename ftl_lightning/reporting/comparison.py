@@ -211,10 +211,10 @@ def short_overview(results: pd.DataFrame) -> Table:
         )
     brackets = _brackets(results) if any("[" in line[1] + line[2] for line in lines) else ""
     caption = (
-        f"New concepts, mean ± standard error over tasks{brackets}. {OURS} (this method): the paper's form of the concept unless "
-        "named; networks, views and losses are ours. Lead: over the best baseline unless named, with its 95 % interval over tasks"
+        f"New concepts, mean ± standard error over tasks{brackets}. {OURS} (this method): the paper's form of the concept or "
+        "the form named; networks, views and losses are ours. Lead: over the best baseline or that named, with 95 % interval over tasks"
     )
-    head = ["domain: setting, metric", OURS, "best baseline", "best without pretraining, oracle", "lead"]
+    head = ["domain: setting, metric", OURS, "best baseline", "best without pretraining; oracle", "lead"]
     return make_table(None, "overview", caption, lines, head)
 
 
@@ -280,7 +280,7 @@ def _overview(results: pd.DataFrame, lines: Sequence[tuple[Domain, str, str]], c
             line.append(", ".join(f"{form} {cell}".strip() for form, cell in cell_of.items() if cell != MISSING) or MISSING)
         cells.append(line)
     head = ["domain: setting, metric", "lead", *grouped]
-    legend = f". {PAPERS_METHOD.name}: the paper's form of the concept unless named; guidance, networks, views and losses are ours"
+    legend = f". {PAPERS_METHOD.name}: the paper's form or the form named; guidance, networks, views and losses are ours"
     caption = (
         f"Ours and the baselines, mean ± standard error over tasks{_brackets(results)}; lead: by how much ours is better than the "
         f"best baseline, with its 95 % interval over tasks{legend * (len(grouped.get(OURS, ())) > 1)}"

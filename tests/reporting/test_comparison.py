@@ -89,7 +89,7 @@ def test_the_overview_fits_on_one_screen_and_names_the_best_baseline(results: Pa
     assert short["FTL-IGM"] == line["FTL-IGM"]
     assert short["lead"] == "+0.30, undecided (2 tasks)"  # against the best baseline, which has a column
     assert short["best baseline"].startswith("BC 0.50")
-    assert short["best without pretraining, oracle"] == "random scenes 0.15"
+    assert short["best without pretraining; oracle"] == "random scenes 0.15"
     *_, references = overview_tables(read_study(results, "comparison"))
     assert references.cells["references"].tolist() == ["random scenes 0.15"]
 
@@ -101,7 +101,7 @@ def test_the_short_overview_has_all_domains_with_the_best_baseline_and_reference
     names = [subject.partition(":")[0] for subject in cells.index]
     assert list(dict.fromkeys(names)) == ["agent", "driving", "mocap", "object_rearrangement", "tabletop"]
     push = cells.loc["tabletop: new concept, closed loop success"]
-    assert push["best without pretraining, oracle"] == "straight push 0.98, expert (oracle) 1.00"
+    assert push["best without pretraining; oracle"] == "straight push 0.98, expert (oracle) 1.00"
     assert push["best baseline"].startswith("LoRA fine-tuning 0.96")
 
 
