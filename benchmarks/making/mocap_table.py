@@ -39,7 +39,7 @@ def cell(values: "pd.Series[float]", digits: int = 2) -> str:
     """Mean over seeds, and the spread over them in brackets; a dash where there are none."""
     if values.empty:
         return "-"
-    spread = f" ({values.std(ddof=0):.{digits}f})" if len(values) > 1 and digits else ""
+    spread = f" ({values.std(ddof=1):.{digits}f})" if len(values) > 1 and digits else ""
     return f"{values.mean():.{digits}f}{spread}"
 
 

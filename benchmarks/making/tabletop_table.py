@@ -49,7 +49,7 @@ def cell(values: "pd.Series[float]") -> str:
     """Mean over seeds ± their spread; a dash where there are none."""
     if values.empty:
         return "-"
-    return number(values.mean()) + (f" ± {number(values.std(ddof=0))}" if len(values) > 1 else "")
+    return number(values.mean()) + (f" ± {number(values.std(ddof=1))}" if len(values) > 1 else "")
 
 
 def table(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:

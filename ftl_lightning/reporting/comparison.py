@@ -212,7 +212,7 @@ def short_overview(results: pd.DataFrame) -> Table:
     brackets = _brackets(results) if any("[" in line[1] + line[2] for line in lines) else ""
     caption = (
         f"New concepts, mean ± standard error over tasks{brackets}. {OURS} (this method): the paper's form of the concept or "
-        "the form named; networks, views and losses are ours. Lead: over the best baseline or that named, with 95 % interval over tasks"
+        "the form named; networks, views and losses are ours. Lead: over the best baseline or that named, 95 % interval over tasks"
     )
     head = ["domain: setting, metric", OURS, "best baseline", "best without pretraining; oracle", "lead"]
     return make_table(None, "overview", caption, lines, head)

@@ -4,7 +4,7 @@ A data set is a folder. ``meta/info.json`` describes the features of a frame, ``
 files, and ``meta`` holds tasks and episodes. An episode is a demonstration. Its states are ``observation.state``, other vectors
 named ``observation.NAME`` are observed features that are known at every time, and the text of its task is the concept. Frames are
 sorted by ``frame_index``. An episode whose task changes is cut into a demonstration for each part with one task. Faults of
-``frame_index`` and ``timestamp`` are noted on standard error. Actions, images and videos are not read.
+``frame_index`` and ``timestamp`` are noted on standard error. Images and videos are not read.
 
 The file ``meta/ftl_lightning.json``, ignored by other programs, holds what the format cannot: the domain, units of columns, names
 of features that are known only at the start, and provenance.

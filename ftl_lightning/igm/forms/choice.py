@@ -257,16 +257,15 @@ def by_skill(
         chosen = replace(chosen, variation=variation)
     if share:
         chosen = replace(_made(model, demonstrations, maker, chosen, variation), share=share)
-    skills = {name: left.skill(value.score.mean()) for name, value in (drawn | references).items()}
-    rival = max(references, key=lambda name: skills[name])
+    every = drawn | references | {VARIED: made[VARIED, usual]}
+    skills = {name: left.skill(value.score.mean()) for name, value in every.items()}
+    rival = max((*references, VARIED), key=lambda name: skills[name])
     beside = f"the best reference, the {rival}, has {skills[rival]:.2f}"
     varied = maker if not variation or maker == VARIED else f"{maker}, varied"
-    skills[VARIED] = left.skill(made[VARIED, usual].score.mean())
     called = form if not share else varied if share == 1 else f"{form} and {varied}"
     skills[called] = left.skill(mixture[number].mean())
     numbers = {f"{SKILL}{name}": round(value, 4) for name, value in skills.items()}
     if (known := references.get(KNOWN)) is not None:
-        every = drawn | references | {VARIED: made[VARIED, usual]}
         nearer = {name: left.nearer(value, known) for name, value in every.items()}
         mixed = (1 - share, both[variation]), (share, made[maker, variation])
         nearer[called] = sum(part * left.nearer(value, known) for part, value in mixed)
