@@ -81,15 +81,17 @@ def untrained(places: Places) -> FewShot:
     return FewShot(net.requires_grad_(False).eval(), settings)
 
 
-def test_the_loss_of_a_combination_is_the_quadratic_function_of_its_weights(model: FewShot) -> None:
+@pytest.mark.parametrize("discount", [1.0, 0.5, 0.0])
+def test_the_loss_of_a_combination_is_the_quadratic_function_of_its_weights(model: FewShot, discount: float) -> None:
+    loss = Loss(kind="clean", discount=discount)
     net, few = model.model, walks("between", 3)
     draw = torch.Generator().manual_seed(1)
     draws = net.draws(6, 1.0, draw)
     states, observed = net.windows(few, torch.zeros(6, dtype=torch.int64), torch.zeros(6), draw)
-    products = net.products(states, observed, None, draws, Loss(kind="clean"))
+    products = net.products(states, observed, None, draws, loss)
     weights = torch.tensor([0.7, -0.4, 1.3])
     composition = Composition(net.training_embeddings[None, :, None], weights[None])
-    direct = net.losses(states, observed, composition, draws, Loss(kind="clean"))[0]
+    direct = net.losses(states, observed, composition, draws, loss)[0]
     linear, square = products[:, 0, 1:] @ weights, torch.einsum("i,sij,j->s", weights, products[:, 1:, 1:], weights)
     torch.testing.assert_close(products[:, 0, 0] - 2 * linear + square, direct, rtol=1e-4, atol=1e-5)
 
