@@ -26,6 +26,7 @@ METHODS = (
     ("one set for the whole plan, K = 2", "FTL-IGM", "", 2),
     ("LoRA fine-tuning", "LoRA fine-tuning", "", 1),
     ("language", "language", "", 0),
+    ("BC, our network", "BC, our network", "", 1),
     ("BC", "BC", "", 1),
     ("CVAE", "CVAE", "", 1),
     ("in-context", "in-context", "", 0),
