@@ -109,7 +109,7 @@ def denoising_loss(
 
 def state_weights(discount: float, clean: Tensor) -> Tensor:
     """Weights ``discount ** k`` of the states of plans ``(batch, horizon, state)``, with mean 1: ``(horizon, 1)``."""
-    weights = discount ** torch.arange(clean.shape[1], device=clean.device)[:, None]
+    weights = float(discount) ** torch.arange(clean.shape[1], device=clean.device)[:, None]
     return weights / weights.mean()
 
 

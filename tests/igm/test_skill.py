@@ -81,7 +81,7 @@ def untrained(places: Places) -> FewShot:
     return FewShot(net.requires_grad_(False).eval(), settings)
 
 
-@pytest.mark.parametrize("discount", [1.0, 0.5, 0.0])
+@pytest.mark.parametrize("discount", [1, 1.0, 0.5, 0.0])
 def test_the_loss_of_a_combination_is_the_quadratic_function_of_its_weights(model: FewShot, discount: float) -> None:
     loss = Loss(kind="clean", discount=discount)
     net, few = model.model, walks("between", 3)
