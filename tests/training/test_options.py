@@ -29,7 +29,7 @@ PRETRAINING_GROUPS: Mapping[str, type] = {"loss": pretraining.LossOptions, "code
 OTHER: dict[str, Any] = {"initial_omega": 0.7, "off_span": 0.5, "initial_spread": 0.2, "start": "concepts", "knots": 4}
 OTHER |= {"restarts": 2, "screening": 3, "learning_rate": 0.02, "samples": 5, "tolerance": 0.3, "precision": "bf16-mixed"}
 OTHER |= {"weight_learning_rate": 0.004, "guidance_scale": 1.5, "training_omega": 0.9, "modes": "each", "mode_samples": 6}
-OTHER |= {"adapter": 0, "adapter_learning_rate": 0.01, "adapter_scope": "all", "loss": "v", "timestep_power": 2.0}
+OTHER |= {"adapter": 0, "adapter_learning_rate": 0.01, "adapter_scope": "all", "loss": "v", "timestep_power": 2.0, "discount": 0.5}
 """An allowed value of every option of an inversion that is in a group."""
 
 
@@ -77,7 +77,7 @@ def test_options_go_from_flat_names_into_groups_and_back() -> None:
         samples=5, restarts=2, screening=3, learning_rate=0.02, tolerance=0.3, precision="bf16-mixed"
     )
     assert settings.modes == ModeOptions(sets="each", samples=6)
-    assert settings.loss == Loss(kind="v", timestep_power=2.0)
+    assert settings.loss == Loss(kind="v", timestep_power=2.0, discount=0.5)
     usual = InversionSettings()
     assert usual.changed(**flat(of_groups(usual), INVERSION)) == usual
     assert all(value != flat(of_groups(usual), INVERSION)[name] for name, value in OTHER.items() if name != "adapter")

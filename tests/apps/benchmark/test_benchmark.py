@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -261,7 +262,7 @@ def test_the_leaderboard_of_a_folder(copy: Path, capsys: pytest.CaptureFixture[s
     assert text == leaderboard(read_submissions(Path("all")))
     lines = [line for line in text.splitlines() if line.startswith("| *")]
     assert [line.split("|")[1].strip() for line in lines[-1:]] == ["*random kind (chance)*"]
-    assert any(line.startswith("| **replay** | 0.99 ± 0.01 |") for line in lines)
+    assert any(re.match(r"\| \*\*replay\*\*( ≈)? \| 0.99 ± 0.01 \|", line) for line in lines)  # marked on another machine
     shutil.copy("all/replay.json", "all/twice.json")
     assert "expected one submission of 'replay', found two" in line_of(capsys, "--leaderboard", "page.md", "--submissions", "all")
     assert "expected a folder of submissions" in line_of(capsys, "--leaderboard", "page.md", "--submissions", "none")
