@@ -99,7 +99,7 @@ def test_the_short_overview_has_all_domains_with_the_best_baseline_and_reference
     cells = short_overview(committed).cells.set_index("domain: setting, metric")
     assert len(cells) == LINES
     names = [subject.partition(":")[0] for subject in cells.index]
-    assert list(dict.fromkeys(names)) == ["agent", "driving", "mocap", "object_rearrangement", "tabletop"]
+    assert list(dict.fromkeys(names)) == ["navigation", "driving", "motion", "rearrangement", "tabletop"]
     push = cells.loc["tabletop: new concept, closed loop success"]
     assert push["best without pretraining; oracle"] == "straight push 0.98, expert (oracle) 1.00"
     assert push["best baseline"].startswith("LoRA fine-tuning 0.96")
