@@ -102,13 +102,13 @@ def _followed(of: Settings) -> str:
 
 ROWS: tuple[tuple[str, Callable[[Settings], str], str], ...] = (
     ("network", _network, "MLP; temporal U-Net of width 128 in all domains but object rearrangement; ResNet-18 for images"),
-    ("pretraining: steps x windows", _pretraining, "a million x 64 (by reference to Decision Diffuser)"),
+    ("pretraining: steps x windows", _pretraining, "a million x 64, object rearrangement 200,000 x 64 (code)"),
     ("form of a concept", _concept, "K = 2, one set, alike at all times"),
     ("guidance weight omega", _omega, "1.2; 1.6; learned; 1.8; learned (in this order)"),
     ("weight of a training concept beside a learned one", _training_weight, "omega, or 1 where that is learned"),
     ("learning: steps at most x samples (of each mode)", _learning, "50,000 x 2"),
     ("demonstrations of a new concept", _demonstrations, "5; 5; 5; 3 or 2; 10"),
-    ("sampler, steps, temperature", _sampler, "DDPM, as Decision Diffuser"),
+    ("sampler, steps, temperature", _sampler, "DDPM, 100 steps; below 1, in the code 1"),
     ("closed loop: steps that a plan is followed for", _followed, "1; in table-top 32"),
 )
 """What a row is called, what it says of a configuration, and the paper's value."""

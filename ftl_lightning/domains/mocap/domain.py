@@ -11,7 +11,7 @@ from ftl_lightning.data.features import InitialStates, Observed, check_starts
 from ftl_lightning.domains.comparison import OURS, WITH_KNOTS, WITH_MODES, Compared, Comparison
 from ftl_lightning.domains.domain import ACCURACY, Concepts, Domain, Metric, Plans, Recordings, View, deferred
 from ftl_lightning.domains.mocap.judge import identity
-from ftl_lightning.domains.mocap.skeleton import COLUMNS, GROUPS, HIPS, HORIZON, NAME, OBSERVED, POSE, RIGID, as_joints, drawn_poses
+from ftl_lightning.domains.mocap.skeleton import COLUMNS, GROUPS, HIPS, HORIZON, NAME, OBSERVED, POSE, RIGID, as_joints, drawn_poses, mean_pose
 from ftl_lightning.domains.mocap.source import Recorded
 from ftl_lightning.domains.mocap.tasks import NEW_CONCEPTS, SUITES, TESTED, TRAINING_CONCEPTS, action, judged
 from ftl_lightning.domains.pictures import Show
@@ -93,8 +93,20 @@ _RIGID = View(
     perturb=begun_elsewhere,
     same_columns=True,
 )
+def _leaving(states: Tensor, observed: Observed) -> Tensor:
+    """Share of the initial pose ``(sample, frame, 42)``, less the mean pose, in the frames that leave it: 1 at first, then 0."""
+    share = torch.arange(states.shape[1], device=states.device) / (sum(BLENDED) / 2)
+    fade = (1 + torch.cos(torch.pi * share.clamp(max=1))) / 2
+    return fade[None, :, None] * (observed[POSE] - mean_pose().to(states))[:, None]
+
+
 VIEWS = {
     "rigid": _RIGID,
+    "left": replace(
+        _RIGID,
+        encode=lambda states, observed: states - _leaving(states, observed),
+        decode=lambda states, observed: smoothed(states + _leaving(states, observed), observed),
+    ),
     "smooth": replace(_RIGID, decode=smoothed),
     "steps": View(OBSERVED, observe=lambda observed: observed, encode=_encode_steps, decode=_decode_steps),
 }

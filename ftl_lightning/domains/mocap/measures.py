@@ -237,7 +237,7 @@ CONDITIONS: Mapping[str, Mapping[str, Condition]] = {
 }
 """Conditions of each action's rule, by name."""
 THRESHOLDS: Mapping[str, Mapping[str, float]] = json.loads((Path(__file__).parent / "rules.json").read_text(encoding="utf-8"))
-"""Thresholds of :data:`CONDITIONS`, set from recordings alone by ``benchmarks/experiments/mocap_rules.py``, before any sample."""
+"""Thresholds of :data:`CONDITIONS`, set from recordings alone by ``benchmarks/experiments/mocap_rules.py``."""
 
 
 def holds(action: str, name: str, states: Tensor, thresholds: Mapping[str, float] | None = None) -> Tensor:

@@ -151,6 +151,11 @@ def fit_poses(poses: Tensor, directions: int, path: Path) -> None:
     save_tensors(path, BEGINNINGS, {"mean": mean.float(), "directions": scaled.float()}, {"poses": len(poses)})
 
 
+def mean_pose() -> Tensor:
+    """Mean ``(42,)`` of :func:`drawn_poses`, in metres."""
+    return _distribution()[0]
+
+
 def drawn_poses(count: int, draw: torch.Generator) -> Tensor:
     """Samples ``(count, 42)`` of the shipped Gaussian, in metres, on the generator's device."""
     mean, directions = (value.to(draw.device) for value in _distribution())
