@@ -203,7 +203,7 @@ def short_overview(results: pd.DataFrame) -> Table:
         lines.append(
             [
                 _subject(domain, setting, metric),
-                ", ".join(f"{form} {cell}".strip() for form, cell in ours) or MISSING,
+                ", ".join(f"{form.replace(f' {CHOSEN}', f' ({CHOSEN})')} {cell}".strip() for form, cell in ours) or MISSING,
                 MISSING if rival is None else f"{label(*rival)} {_cell(domain, rows, rival, setting, metric)}",
                 ", ".join(f"{name} {mean:.2f}" for name, mean in best) or MISSING,
                 MISSING if lead is None else prefix + (f"{lead.amount}, {lead.shown}" if lead.baseline == rival else str(lead)),
@@ -211,8 +211,9 @@ def short_overview(results: pd.DataFrame) -> Table:
         )
     brackets = _brackets(results) if any("[" in line[1] + line[2] for line in lines) else ""
     caption = (
-        f"New concepts, mean ± standard error over tasks{brackets}. {OURS} (this method): the paper's form of the concept or "
-        "the form named; networks, views and losses are ours. Lead: over the best baseline or that named, 95 % interval over tasks"
+        f"New concepts, mean ± standard error over tasks{brackets}. {OURS} (this method): the concept in the paper's form "
+        "unless another is named; networks, representations and losses are ours (the loss of object rearrangement is the paper's). "
+        "Lead: over the best baseline unless another is named, 95 % interval over tasks"
     )
     head = ["domain: setting, metric", OURS, "best baseline", "best without pretraining; oracle", "lead"]
     return make_table(None, "overview", caption, lines, head)
@@ -280,7 +281,7 @@ def _overview(results: pd.DataFrame, lines: Sequence[tuple[Domain, str, str]], c
             line.append(", ".join(f"{form} {cell}".strip() for form, cell in cell_of.items() if cell != MISSING) or MISSING)
         cells.append(line)
     head = ["domain: setting, metric", "lead", *grouped]
-    legend = f". {PAPERS_METHOD.name}: the paper's form or the form named; guidance, networks, views and losses are ours"
+    legend = f". {PAPERS_METHOD.name}: the paper's form unless another is named; networks, representations, most losses and guidance weights are ours"
     caption = (
         f"Ours and the baselines, mean ± standard error over tasks{_brackets(results)}; lead: by how much ours is better than the "
         f"best baseline, with its 95 % interval over tasks{legend * (len(grouped.get(OURS, ())) > 1)}"
