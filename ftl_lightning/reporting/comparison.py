@@ -212,7 +212,7 @@ def short_overview(results: pd.DataFrame) -> Table:
     brackets = _brackets(results) if any("[" in line[1] + line[2] for line in lines) else ""
     caption = (
         f"New concepts, mean ± standard error over tasks{brackets}. {OURS} (this method): the concept in the paper's form "
-        "unless another is named; networks, representations and losses are ours (the loss of object rearrangement is the paper's). "
+        "unless another is named; networks, representations and most losses are ours. "
         "Lead: over the best baseline unless another is named, 95 % interval over tasks"
     )
     head = ["domain: setting, metric", OURS, "best baseline", "best without pretraining; oracle", "lead"]
