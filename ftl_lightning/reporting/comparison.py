@@ -281,7 +281,10 @@ def _overview(results: pd.DataFrame, lines: Sequence[tuple[Domain, str, str]], c
             line.append(", ".join(f"{form} {cell}".strip() for form, cell in cell_of.items() if cell != MISSING) or MISSING)
         cells.append(line)
     head = ["domain: setting, metric", "lead", *grouped]
-    legend = f". {PAPERS_METHOD.name}: the paper's form unless another is named; networks, representations, most losses and guidance weights are ours"
+    legend = (
+        f". {PAPERS_METHOD.name}: the paper's form unless another is named; "
+        "networks, representations, most losses and guidance weights are ours"
+    )
     caption = (
         f"Ours and the baselines, mean ± standard error over tasks{_brackets(results)}; lead: by how much ours is better than the "
         f"best baseline, with its 95 % interval over tasks{legend * (len(grouped.get(OURS, ())) > 1)}"

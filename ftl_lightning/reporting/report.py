@@ -26,6 +26,7 @@ from ftl_lightning.reporting.table import Table, domain_of, metrics, of_method, 
 from ftl_lightning.reporting.tables import as_learned_most, changes_table, curves_table, tables
 from ftl_lightning.services.errors import require, shown
 from ftl_lightning.services.files import read_text
+from ftl_lightning.services.progress import bar
 from ftl_lightning.services.tensor_file import atomic, write_text
 from ftl_lightning.services.text import say
 
@@ -53,30 +54,34 @@ def write_report(results: Path, out: Path, readme: Path | None = None) -> str:
     if count := replaced(ablations):
         say(f"{results}: {count} rows are left out, since the same was measured again later in another configuration")
     everything, headline = [], []
-    for name in sorted(set(rows["domain"])):
-        domain = domain_of(name, rows)
-        domain_tables = _ablations(domain, ablations, out / name)
-        headline += domain_tables[:1]
-        if name in set(comparison["domain"]):
-            domain_tables += _compared(domain, comparison, out / name)
-        elif any(method.name != OURS for method in methods(compared(domain, ablations))):
-            domain_tables += _compared(domain, as_learned_most(domain, select(ablations, domain=name)), out / name)
-        if name in set(curves["domain"]):
-            domain_tables.append(_written(curves_table(domain, curves), out / name))
-            _save(growth(domain, curves), out / name / "curves.png")
-        if name in set(changes["domain"]):
-            domain_tables.append(_written(changes_table(domain, changes), out / name))
-        if name in set(measured["domain"]):
-            _save(frontier(domain, measured), out / name / "frontier.png")
-            domain_tables.append(_written(frontier_table(domain, measured), out / name))
-        everything += domain_tables
-    if curve_by_name := read_speed(results):
-        _save(learning_time(curve_by_name), out / "speed.png")
-    beside = all_methods(comparison, ablations)
-    if not beside.empty:
-        everything += [_written(table, out) for table in overview_tables(beside)]
-        _save(overview_dots(beside), out / "overview.png")
-        headline = [short_overview(beside)]
+    names = sorted(set(rows["domain"]))
+    with bar("tables and figures", len(names) + 1, lines=False) as advance:
+        for name in names:
+            domain = domain_of(name, rows)
+            domain_tables = _ablations(domain, ablations, out / name)
+            headline += domain_tables[:1]
+            if name in set(comparison["domain"]):
+                domain_tables += _compared(domain, comparison, out / name)
+            elif any(method.name != OURS for method in methods(compared(domain, ablations))):
+                domain_tables += _compared(domain, as_learned_most(domain, select(ablations, domain=name)), out / name)
+            if name in set(curves["domain"]):
+                domain_tables.append(_written(curves_table(domain, curves), out / name))
+                _save(growth(domain, curves), out / name / "curves.png")
+            if name in set(changes["domain"]):
+                domain_tables.append(_written(changes_table(domain, changes), out / name))
+            if name in set(measured["domain"]):
+                _save(frontier(domain, measured), out / name / "frontier.png")
+                domain_tables.append(_written(frontier_table(domain, measured), out / name))
+            everything += domain_tables
+            advance()
+        if curve_by_name := read_speed(results):
+            _save(learning_time(curve_by_name), out / "speed.png")
+        beside = all_methods(comparison, ablations)
+        if not beside.empty:
+            everything += [_written(table, out) for table in overview_tables(beside)]
+            _save(overview_dots(beside), out / "overview.png")
+            headline = [short_overview(beside)]
+        advance()
     found = ", ".join(sorted(set(select(rows, role=METHOD)["metric"])))
     require(everything or curve_by_name, str(results), "a metric that tables show", f"{found} alone" if found else "none")
     if readme:

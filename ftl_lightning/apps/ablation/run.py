@@ -55,11 +55,13 @@ def check(cells: Sequence[Cell]) -> None:
     """
     outputs = {cell.options["model.output"] for cell in cells if cell.verb == "fit" and "model.output" in cell.options}
     mistakes = {}
-    for cell in cells:
-        try:
-            _check(cell, outputs)
-        except (UserError, ArgumentError) as error:
-            mistakes[cell.command] = " ".join(str(error).split())
+    with bar("cells to check", len(cells), lines=False) as advance:
+        for cell in cells:
+            try:
+                _check(cell, outputs)
+            except (UserError, ArgumentError) as error:
+                mistakes[cell.command] = " ".join(str(error).split())
+            advance()
     if mistakes:
         messages = dict.fromkeys(mistakes.values())
         raise UserError(f"ablation: {len(mistakes)} of {len(cells)} cells cannot run, none was started: {'; '.join(messages)}")
