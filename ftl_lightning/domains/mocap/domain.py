@@ -11,7 +11,19 @@ from ftl_lightning.data.features import InitialStates, Observed, check_starts
 from ftl_lightning.domains.comparison import OURS, WITH_KNOTS, WITH_MODES, Compared, Comparison
 from ftl_lightning.domains.domain import ACCURACY, Concepts, Domain, Metric, Plans, Recordings, View, deferred
 from ftl_lightning.domains.mocap.judge import identity
-from ftl_lightning.domains.mocap.skeleton import COLUMNS, GROUPS, HIPS, HORIZON, NAME, OBSERVED, POSE, RIGID, as_joints, drawn_poses, mean_pose
+from ftl_lightning.domains.mocap.skeleton import (
+    COLUMNS,
+    GROUPS,
+    HIPS,
+    HORIZON,
+    NAME,
+    OBSERVED,
+    POSE,
+    RIGID,
+    as_joints,
+    drawn_poses,
+    mean_pose,
+)
 from ftl_lightning.domains.mocap.source import Recorded
 from ftl_lightning.domains.mocap.tasks import NEW_CONCEPTS, SUITES, TESTED, TRAINING_CONCEPTS, action, judged
 from ftl_lightning.domains.pictures import Show
@@ -93,25 +105,28 @@ _RIGID = View(
     perturb=begun_elsewhere,
     same_columns=True,
 )
-def _leaving(states: Tensor, observed: Observed) -> Tensor:
-    """Share of the initial pose ``(sample, frame, 42)``, less the mean pose, in the frames that leave it: 1 at first, then 0."""
+
+
+def _fading(states: Tensor, observed: Observed) -> Tensor:
+    """Initial pose less the mean pose ``(sample, frame, 42)``, which fades out over the frames of a transition."""
     share = torch.arange(states.shape[1], device=states.device) / (sum(BLENDED) / 2)
-    fade = (1 + torch.cos(torch.pi * share.clamp(max=1))) / 2
-    return fade[None, :, None] * (observed[POSE] - mean_pose().to(states))[:, None]
+    weight = (1 + torch.cos(torch.pi * share.clamp(max=1))) / 2
+    return weight[None, :, None] * (observed[POSE] - mean_pose().to(states))[:, None]
 
 
 VIEWS = {
     "rigid": _RIGID,
-    "left": replace(
+    "faded": replace(
         _RIGID,
-        encode=lambda states, observed: states - _leaving(states, observed),
-        decode=lambda states, observed: smoothed(states + _leaving(states, observed), observed),
+        encode=lambda states, observed: states - _fading(states, observed),
+        decode=lambda states, observed: smoothed(states + _fading(states, observed), observed),
     ),
     "smooth": replace(_RIGID, decode=smoothed),
     "steps": View(OBSERVED, observe=lambda observed: observed, encode=_encode_steps, decode=_decode_steps),
 }
 """``rigid`` has training states as in files, and generated states with rigid bones; ``smooth`` adds a running mean of generated
-states. ``steps`` has differences of poses, for autoregressive methods."""
+states. ``faded`` also subtracts the initial pose, which fades out: after a third of a second plans do not depend on how the network
+subtracts it. ``steps`` has differences of poses, for autoregressive methods."""
 
 
 _DRAWING, _MEASURES = "ftl_lightning.domains.mocap.rendering", "ftl_lightning.domains.mocap.measures"
