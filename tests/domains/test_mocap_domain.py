@@ -10,8 +10,8 @@ import torch
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.mocap import DOMAIN, skeleton
-from ftl_lightning.domains.mocap.domain import with_rigid_bones
-from ftl_lightning.domains.mocap.measures import bone_error
+from ftl_lightning.domains.mocap.domain import VIEWS, with_rigid_bones
+from ftl_lightning.domains.mocap.measures import SETTLED, bone_error
 from ftl_lightning.domains.mocap.skeleton import HORIZON, POSE, R_WRIST, as_joints, bone_lengths, mirrored
 from ftl_lightning.domains.mocap.source import FILE, LONGEST, Recorded, Recordings, at_rest, glitches, hang_down, pieces
 from ftl_lightning.domains.mocap.tasks import HELD_OUT, NEW_CONCEPTS, SEGMENTS, SUITES, TRAINING_CONCEPTS, cleaned, mirrored_text
@@ -57,6 +57,17 @@ def test_generated_bones_are_as_long_as_at_the_start_and_recorded_ones_stay_as_t
     assert bone_error("walk", rigid, InitialStates(start)).max() < 1e-5
     for joint in (skeleton.R_SHOULDER, skeleton.NECK):  # no rigid bone leads there
         assert torch.equal(as_joints(rigid)[..., joint, :], as_joints(generated)[..., joint, :])
+
+
+def test_the_initial_pose_fades_out_of_states_within_a_third_of_a_second() -> None:
+    view, states = VIEWS["faded"], torch.from_numpy(motion(HORIZON, 2)).flatten(1)[None]
+    start = {POSE: states[:, 0]}
+    encoded = view.encode(states, start)
+    assert torch.allclose(encoded[:, 0], skeleton.mean_pose()[None], atol=1e-6)
+    assert torch.equal(encoded[:, SETTLED:], states[:, SETTLED:])
+    elsewhere = {POSE: states[:, 0] + 0.02}
+    assert (view.encode(states, elsewhere)[:, 1:SETTLED] != encoded[:, 1:SETTLED]).any()
+    assert torch.allclose(view.decode(encoded, start), VIEWS["smooth"].decode(states, start), atol=1e-6)
 
 
 def test_the_mirror_image_exchanges_left_and_right() -> None:
