@@ -21,7 +21,7 @@ Which results of *Few-Shot Task Learning through Inverse Generative Modeling* ar
 tasks, in brackets the standard deviation over seeds. No setting is exactly the paper's: texts are embedded by MiniLM, and networks,
 most losses, learning and sampling are [ours](differences.md). No setting of its new concepts has enough tasks for a
 [test](baselines.md#who-is-ahead) of differences. In a terminal: `python -m ftl_lightning report --paper "Table 4"`; `--run true`
-measures the numbers again.
+measures a table's numbers again (not Figures 6 (right), 7 and 13).
 """
 
 

@@ -106,7 +106,7 @@ ROWS: tuple[tuple[str, Callable[[Settings], str], str], ...] = (
     ("form of a concept", _concept, "K = 2, one set, alike at all times"),
     ("guidance weight omega", _omega, "1.2; 1.6; learned; 1.8; learned (in this order)"),
     ("weight of a training concept beside a learned one", _training_weight, "omega, or 1 where that is learned"),
-    ("learning: steps at most x samples (of each mode)", _learning, "50,000 x 2"),
+    ("learning: steps at most x samples (of each mode)", _learning, "50,000 x 2 (code)"),
     ("demonstrations of a new concept", _demonstrations, "5; 5; 5; 3 or 2; 10"),
     ("sampler, steps, temperature", _sampler, "DDPM, 100 steps; below 1, in the code 1"),
     ("closed loop: steps that a plan is followed for", _followed, "1; in table-top 32"),

@@ -123,7 +123,7 @@ def _learned_from(rows: pd.DataFrame) -> str:
 
 
 def _leads(domain: Domain, rows: pd.DataFrame, setting: str, metric: str) -> list[Lead]:
-    """Ours against each baseline; for training concepts without language, which equals ours there."""
+    """Ours against each baseline; for training concepts without language, which is ours with another guidance weight there."""
     trained = setting in training_settings(domain)
     rivals = [method for method in methods(rows) if method.name != OURS and not (method.name == LANGUAGE and trained)]
     tasks = (task for suite in domain.concepts.suites.values() for task in suite.tasks)
@@ -211,9 +211,9 @@ def short_overview(results: pd.DataFrame) -> Table:
         )
     brackets = _brackets(results) if any("[" in line[1] + line[2] for line in lines) else ""
     caption = (
-        f"New concepts, mean ± standard error over tasks{brackets}. {OURS} (this method): the concept in the paper's form "
-        "unless another is named; networks, representations and most losses are ours. "
-        "Lead: over the best baseline unless another is named, 95 % interval over tasks"
+        f"New concepts, mean ± standard error over tasks{brackets}. {OURS}: the concept in the paper's form "
+        "unless another is named; networks, representations, most losses and some guidance weights are ours. "
+        "Lead: over the best or the named baseline, 95 % interval over tasks"
     )
     head = ["domain: setting, metric", OURS, "best baseline", "best without pretraining; oracle", "lead"]
     return make_table(None, "overview", caption, lines, head)
@@ -283,7 +283,7 @@ def _overview(results: pd.DataFrame, lines: Sequence[tuple[Domain, str, str]], c
     head = ["domain: setting, metric", "lead", *grouped]
     legend = (
         f". {PAPERS_METHOD.name}: the paper's form unless another is named; "
-        "networks, representations, most losses and guidance weights are ours"
+        "networks, representations, most losses and some guidance weights are ours"
     )
     caption = (
         f"Ours and the baselines, mean ± standard error over tasks{_brackets(results)}; lead: by how much ours is better than the "
@@ -317,8 +317,9 @@ def _references(domain: Domain, rows: pd.DataFrame, references: pd.DataFrame, se
         counts = against(ours, policy)
         if counts is not None and sum(counts[:2]) <= (1 - ALIKE) * counts[2]:
             agreeing[policy] = f" ({same_outcome(*counts)})"
-    means = select(references, setting=setting, metric=metric).groupby("method")["value"].mean().sort_values()
-    return ", ".join(f"{name} {mean:.2f}{agreeing.get(str(name), '')}" for name, mean in means.items()) or MISSING
+    groups = select(references, setting=setting, metric=metric).groupby("method")
+    means = sorted((number.mean, str(name)) for name, rows in groups if (number := summarise(rows)))
+    return ", ".join(f"{name} {mean:.2f}{agreeing.get(name, '')}" for mean, name in means) or MISSING
 
 
 def _mean(rows: pd.DataFrame) -> str:
