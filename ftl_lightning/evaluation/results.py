@@ -33,7 +33,7 @@ class Row:
         form: form of the method, see :class:`~ftl_lightning.domains.comparison.Compared`; empty for the paper's.
         variant: label of settings of the same method and form, for example ``'entities, free'``; may be empty.
         role: :data:`METHOD` or :data:`REFERENCE`.
-        K: number of concept components; 0 without learning.
+        K: number of concept components in the settings, also for training concepts; 0 without components.
         omega: fixed guidance weight as text, ``'learned'``, or ``'none'`` for a method without; empty for a reference.
         demonstrations: number of demonstrations of the task's concept; 0 without learning.
         seed: seed of pretraining and inversion.
