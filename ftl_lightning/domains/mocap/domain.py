@@ -66,6 +66,11 @@ SHARE = 0.5  # Share of windows with another initial pose
 BLENDED = (8, 12)  # Minimum and maximum frames of the transition to the recorded window
 
 
+def _fade(share: Tensor) -> Tensor:
+    """Cosine weights of the initial pose by the share of the transition that has passed: 1 at 0, 0 from 1 on."""
+    return (1 + torch.cos(torch.pi * share.clamp(max=1))) / 2
+
+
 def begun_elsewhere(states: Tensor, observed: Observed, draw: torch.Generator | None) -> tuple[Tensor, Observed]:
     """Start half of the windows ``(sample, frame, 42)`` in a standing or walking pose with arms down; none without ``draw``.
 
@@ -80,7 +85,7 @@ def begun_elsewhere(states: Tensor, observed: Observed, draw: torch.Generator | 
     length = drawn(count, lambda n: torch.randint(low, high + 1, (n, 1, 1), generator=draw, device=draw.device)).to(device)
     share = torch.arange(states.shape[1], device=device)[None, :, None] / length
     elsewhere = (drawn(count, lambda n: torch.rand((n, 1, 1), generator=draw, device=draw.device)) < SHARE).to(device)
-    weight = elsewhere * (1 + torch.cos(torch.pi * share.clamp(max=1))) / 2
+    weight = elsewhere * _fade(share)
     begun = torch.where(weight > 0, with_rigid_bones(weight * poses + (1 - weight) * states, observed), states)
     return begun, {**observed, POSE: begun[:, 0]}
 
@@ -110,8 +115,7 @@ _RIGID = View(
 def _fading(states: Tensor, observed: Observed) -> Tensor:
     """Initial pose less the mean pose ``(sample, frame, 42)``, which fades out over the frames of a transition."""
     share = torch.arange(states.shape[1], device=states.device) / (sum(BLENDED) / 2)
-    weight = (1 + torch.cos(torch.pi * share.clamp(max=1))) / 2
-    return weight[None, :, None] * (observed[POSE] - mean_pose().to(states))[:, None]
+    return _fade(share)[None, :, None] * (observed[POSE] - mean_pose().to(states))[:, None]
 
 
 VIEWS = {
