@@ -42,7 +42,7 @@ from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.igm.settings import INVERSION
 from ftl_lightning.services.errors import UserError, require, short, shown
 from ftl_lightning.services.modes import usual_modes
-from ftl_lightning.services.progress import bar
+from ftl_lightning.services.progress import Advance, bar
 from ftl_lightning.services.randomness import EVALUATION_SEED
 from ftl_lightning.services.shipped import pretrained_folder, shipped_models, shipped_name
 from ftl_lightning.services.text import Shown
@@ -298,7 +298,7 @@ class FewShot(Shown):
         *,
         steps: int | None = None,
         seed: int = 0,
-        progress: bool = False,
+        progress: bool | Advance = False,
         watch: Callable[[Learning], None] | None = None,
         **changes: Any,
     ) -> LearnedConcept:
@@ -308,7 +308,7 @@ class FewShot(Shown):
             states, observed, name: see :meth:`demonstrations`.
             steps: gradient steps; ``None`` for the tuned number.
             seed: seed of starts, noise and timesteps.
-            progress: show a bar.
+            progress: show a bar, or call a function after each step of all inversions.
             watch: called after each step of the first inversion, for methods with gradient descent; it may sample the concept so
                 far without side effects, or stop by raising an exception.
             changes: options of :class:`~ftl_lightning.igm.settings.InversionSettings`, such as ``form="paper"``.
@@ -359,7 +359,7 @@ class FewShot(Shown):
         call: str,
         steps: int | None,
         seed: int,
-        progress: bool,
+        progress: bool | Advance,
         watch: Callable[[Learning], None] | None,
         changes: Mapping[str, Any],
     ) -> list[LearnedConcept]:
@@ -380,7 +380,8 @@ class FewShot(Shown):
         for note in notes_of(self.model, fitted):
             warnings.warn(note, stacklevel=4)
         watched = None if watch is None else self._watched(names[0], watch)
-        with bar(title, total) if progress else nullcontext(lambda *_: None) as advance:
+        shown = bar(title, total) if progress is True else nullcontext(progress or (lambda *_: None))
+        with shown as advance:
             learned = self.model.learn_concepts(fitted, settings, total, lambda loss: advance(1, f"loss {loss:.3g}"), watched)
         self._examples += [fitted.select(name) for name in names]
         judging = self.judging

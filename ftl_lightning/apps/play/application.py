@@ -76,6 +76,16 @@ class Desk:
         finally:
             self._waiting -= 1
 
+    @property
+    def asked(self) -> bool:
+        """Whether further requests wait for the present one."""
+        return self._waiting > 1
+
+    async def others(self) -> None:
+        """Handle the requests that wait, in the middle of the present one."""
+        self._lock.release()
+        await self._lock.acquire()
+
     def _named(self, model: str) -> Workspace:
         if not model:
             return self._workspace(self._current)
@@ -202,16 +212,24 @@ async def _body(desk: Desk, request: Request, kind: Callable[..., T]) -> T:
 
 
 async def _learned(desk: Desk, request: Request, model: str, body: requests.Learn) -> AsyncIterator[str]:
-    """Progress of learning as JSON lines, until learning ends or the client disconnects."""
+    """Progress of learning as JSON lines, until learning ends or the client disconnects.
+
+    Other requests are handled while a concept is learned again, which takes long.
+    """
     loop, lines = asyncio.get_running_loop(), asyncio.Queue[dict[str, Any] | None]()
     stopped = threading.Event()
 
     def tell(message: Mapping[str, Any] | None) -> None:
         loop.call_soon_threadsafe(lines.put_nowait, None if message is None else dict(message))
 
+    def ended() -> bool:
+        if body.again and desk.asked:
+            asyncio.run_coroutine_threadsafe(desk.others(), loop).result()
+        return stopped.is_set() or desk.ended.is_set()
+
     async def work() -> None:
         try:
-            await desk.work(lambda workspace: workspace.learn(body, tell, lambda: stopped.is_set() or desk.ended.is_set()), model)
+            await desk.work(lambda workspace: workspace.learn(body, tell, ended), model)
         except Stopped:
             pass
         except HTTPException as error:

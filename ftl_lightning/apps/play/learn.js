@@ -1,5 +1,5 @@
 // Steps 1 and 2: the demonstrations that are there, and learning a concept from them.
-const learning = { stop: null, concept: null, from: "", told: "", samples: [], named: false, losses: [], unsaved: new Map() };
+const learning = { stop: null, again: null, concept: null, from: "", seconds: 0, more: "", samples: [], named: false, losses: [], unsaved: new Map() };
 const many = (count, one) => `${count} ${one}${count === 1 ? "" : "s"}`;
 const announce = (text) => { find("announced").textContent = text; };
 
@@ -127,10 +127,12 @@ function learnable() {
   const enough = count >= state.work.wanted, waiting = find("waiting");
   waiting.classList.toggle("warned", enough && !justLearned() && Boolean(doubt()));
   if (enough && !justLearned() && doubt()) waiting.textContent = doubt();
-  else if (learning.concept) waiting.textContent = learning.told;
+  else if (learning.concept) waiting.textContent = learnedTold();
   else if (enough) waiting.textContent = "Press Learn.";
   else waiting.textContent = `Learning starts by itself at demonstration ${state.work.wanted}${count >= 2 ? "; or press Learn now" : ""}.`;
 }
+
+const learnedTold = () => `Learned \u201c${learning.concept.name}\u201d in ${learning.seconds.toFixed(1)} seconds.${learning.more}`;
 
 // Gives the concept that was just learned the name that stands in the field.
 function rename() {
@@ -140,7 +142,6 @@ function rename() {
   attempt(async () => {
     const found = await ask("/api/rename", { id: learning.concept.id, name });
     learning.named = false;
-    learning.told = learning.told.replace(`\u201c${learning.concept.name}\u201d`, () => `\u201c${name}\u201d`);
     learning.concept = { ...learning.concept, name };
     if (learning.unsaved.has(learning.concept.hash + learning.concept.id)) learning.unsaved.set(learning.concept.hash + learning.concept.id, name);
     await renew(found);
@@ -159,7 +160,8 @@ function saveConcept(id) {
 
 // Goes on without what the last concept showed: another model is worked with, or the concept is there no more.
 function noConcept() {
-  Object.assign(learning, { concept: null, from: "", told: "", samples: [] });
+  if (learning.again) learning.again.abort();
+  Object.assign(learning, { concept: null, from: "", samples: [] });
   fill(find("samples"), [], null, () => "");
   find("quality").textContent = "";
   find("progress").hidden = find("learned").hidden = find("meaning").hidden = true;
@@ -174,7 +176,7 @@ function learnInSight() {
 }
 
 async function learn() {
-  if (learning.stop) learning.stop.abort();
+  for (const one of [learning.stop, learning.again]) if (one) one.abort();
   const name = unused((find("name").value.trim() || suggested()).replace(/\s+/g, " ")), stop = learning.stop = new AbortController();
   Object.assign(learning, { concept: null, losses: [], from: shownNow() });
   find("name").value = name;
@@ -187,7 +189,7 @@ async function learn() {
   announce(`Learning ${name}.`);
   learnable();
   await attempt(async () => {
-    for await (const line of askLines("/api/learn", { name, quick: !find("careful").checked }, stop.signal)) {
+    for await (const line of askLines("/api/learn", { name }, stop.signal)) {
       if (stop.signal.aborted) return;
       if (line.error) throw new Error(line.error);
       if (line.loss !== undefined) lossTold(line);
@@ -235,24 +237,57 @@ function lossCurve(steps) {
 }
 
 function learned(line) {
-  learning.concept = line.concept;
-  learning.named = false;
-  learning.samples = line.samples;
-  learning.unsaved.set(line.concept.hash + line.concept.id, line.concept.name);
-  state.concepts = line.concepts;
-  const took = learning.told = `Learned \u201c${line.concept.name}\u201d in ${line.seconds.toFixed(1)} seconds.`;
-  find("waiting").textContent = took;
-  find("quality").textContent = line.quality.line;
-  find("learned").hidden = find("meaning").hidden = false;
-  same("work", line.same);
-  samplesTold(line.samples, line.concept.name);
+  Object.assign(learning, { named: false, seconds: line.seconds, more: line.more ? " It is being learned more thoroughly \u2026" : "" });
+  kept(line);
   if (learning.losses.length) {
     const [last] = learning.losses.at(-1);
     lossCurve(last); // learning stops where little changes
     find("step").textContent = `${last} steps, loss ${learning.losses.at(-1)[1].toFixed(3)}`;
   }
-  announce(`${took} ${line.quality.line} It is in the mix below.`);
+  find("waiting").textContent = learnedTold();
+  announce(`${learnedTold()} ${line.quality.line} It is in the mix below.`);
   mixLearned(line.concept);
+  if (line.more) learnAgain(line.concept.id);
+}
+
+// Shows a learned concept, its samples and their quality.
+function kept(line) {
+  learning.concept = line.concept;
+  learning.samples = line.samples;
+  learning.unsaved.set(line.concept.hash + line.concept.id, line.concept.name);
+  state.concepts = line.concepts;
+  find("quality").textContent = line.quality.line;
+  find("learned").hidden = find("meaning").hidden = false;
+  same("work", line.same);
+  samplesTold(line.samples, line.concept.name);
+}
+
+// Learns a concept in the form that its demonstrations select, which takes longer; what is better replaces it.
+async function learnAgain(id) {
+  const stop = learning.again = new AbortController();
+  document.body.dataset.again = "yes";
+  await attempt(async () => {
+    for await (const line of askLines("/api/learn", { again: id }, stop.signal)) {
+      if (stop.signal.aborted) return;
+      if (line.error) throw new Error(line.error);
+      if (line.done) learnedAgain(line);
+    }
+  });
+  if (learning.again !== stop) return;
+  learning.again = null;
+  document.body.dataset.again = "no";
+}
+
+function learnedAgain(line) {
+  const took = `${line.seconds.toFixed(0)} seconds`;
+  learning.more = line.concept ? ` Learned more thoroughly in ${took}.` : ` Learning more thoroughly for ${took} was not better.`;
+  if (line.concept) {
+    kept(line);
+    noCard(cardKey(line.concept));
+    mixed();
+  }
+  learnable();
+  announce(`${learnedTold()}${line.concept ? ` ${line.quality.line}` : ""}`);
 }
 
 // --- the same as a program

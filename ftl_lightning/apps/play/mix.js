@@ -18,12 +18,21 @@ function conceptList() {
   const order = Object.keys(HEADINGS), sorted = found.toSorted((one, other) => order.indexOf(one.kind) - order.indexOf(other.kind));
   const few = phone.matches && !mix.all && !sought && found.length > FEW;
   const shown = few ? sorted.filter((one, number) => number < FEW || mix.parts.some((part) => part.id === one.id)) : sorted;
-  for (const [key, card] of mix.cards) if (!present.has(key)) { dropCanvas(card.film); inSight.unobserve(card); mix.cards.delete(key); }
+  for (const key of [...mix.cards.keys()]) if (!present.has(key)) noCard(key);
   const groups = Object.keys(HEADINGS).map((kind) => [kind, shown.filter((one) => one.kind === kind)]).filter(([, own]) => own.length);
   find("concepts").replaceChildren(...groups.flatMap(([kind, own]) => [made("h3", { textContent: HEADINGS[kind] }), made("ul", {}, ...own.map(card))]));
   find("all").hidden = !few;
   find("all").textContent = `Show all ${found.length}`;
   if (!shown.length) find("concepts").append(made("p", { className: "note", textContent: "No concept has this name." }));
+}
+
+// Takes the card of a concept away, whose film is another one now.
+function noCard(key) {
+  const card = mix.cards.get(key);
+  if (!card) return;
+  dropCanvas(card.film);
+  inSight.unobserve(card);
+  mix.cards.delete(key);
 }
 
 // Models give the same ids to their concepts.
@@ -257,7 +266,7 @@ function setMix() {
   find("seed").textContent = "set 1";
   find("sought").value = "";
   find("count").value = 8;
-  find("execute").checked = find("careful").checked = false;
+  find("execute").checked = false;
   find("temperature").value = state.temperature;
   find("temperature-value").textContent = Number(find("temperature").value).toFixed(2);
   find("executing").hidden = !state.executes;

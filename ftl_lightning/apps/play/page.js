@@ -98,6 +98,7 @@ async function end() {
   const why = learning.stop ? "Learning is not finished." : lost.length ? `${lost.join(", ")} ${lost.length === 1 ? "is" : "are"} not saved.` : "";
   if (why && !await sure(`${why} End the program all the same?`, "End the program")) return;
   if (learning.stop) learning.stop.abort();
+  if (learning.again) learning.again.abort();
   noQuestions();
   await attempt(async () => {
     await ask("/api/end", {});

@@ -85,13 +85,16 @@ class Nothing:
 
 @dataclass(frozen=True)
 class Learn:
-    """Learn from the current demonstrations: quickly in the paper's form, else in the form selected by the demonstrations."""
+    """Learn the concept ``name`` quickly from the current demonstrations, in the paper's form; or with ``again``, the identifier of
+    a concept that was learned so, from its demonstrations in the form that these select.
+    """
 
-    name: str
-    quick: bool = True
+    name: str = ""
+    again: str = ""
 
     def __post_init__(self) -> None:
-        check_name(self.name)
+        if not self.again:
+            check_name(self.name)
 
 
 @dataclass(frozen=True)

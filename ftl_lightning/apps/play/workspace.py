@@ -21,7 +21,7 @@ from ftl_lightning.few_shot.tuned import OWN
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import KIND, Concept
 from ftl_lightning.igm.forms.quality import GENERATED
-from ftl_lightning.igm.settings import PAPER
+from ftl_lightning.igm.settings import ONE, PAPER
 from ftl_lightning.services.errors import UserError, require, short
 from ftl_lightning.services.tensor_file import kind_of
 
@@ -54,6 +54,7 @@ class Known:
             ``'learned'`` here.
         concept, file: content, and path or name of the concept's file; empty for training concepts.
         learned, demonstrations: how the concept was learned here, and from what; else ``None``.
+        task: task of the demonstrations, if the library gave them; its initial states are sampled from.
         accuracy: fraction of correct samples; ``None`` if not judged.
     """
 
@@ -64,6 +65,7 @@ class Known:
     file: str = ""
     learned: Learned | None = None
     demonstrations: Demonstrations | None = None
+    task: str = ""
     accuracy: float | None = None
 
     @property
@@ -156,10 +158,8 @@ class Workspace:
         """Name and bytes of an ``.npz`` of the current demonstrations, or of a concept's. Raise UserError if there are none."""
         if not key:
             return "demonstrations.npz", as_npz(self._demonstrating.together(""))
-        known = self._known(key)
-        if known.demonstrations is None or known.learned is None:
-            raise UserError(f"id: expected a concept that was learned here, found {short(known.name)!r}")
-        return known.learned.demonstrations, as_npz(known.demonstrations)
+        _, learned, demonstrations = self._learned_here(key)
+        return learned.demonstrations, as_npz(demonstrations)
 
     # Concepts.
 
@@ -173,9 +173,18 @@ class Workspace:
         require(known.kind in ("learned", "opened"), "id", "a concept that was learned or opened here", "one of the model's")
         return known
 
+    def _learned_here(self, key: str) -> tuple[Known, Learned, Demonstrations]:
+        """Concept that was learned here, how, and from what."""
+        known = self._known(key)
+        if known.demonstrations is None or known.learned is None:
+            raise UserError(f"id: expected a concept that was learned here, found {short(known.name)!r}")
+        return known, known.learned, known.demonstrations
+
+    def _content(self, key: str) -> Json:
+        return {"id": key, **self._concepts[key].content, "hash": self._model.model.hash}
+
     def _listed(self) -> list[Json]:
-        model_hash = self._model.model.hash
-        return [{"id": key, **known.content, "hash": model_hash} for key, known in self._concepts.items()]
+        return [self._content(key) for key in self._concepts]
 
     def _open(self, name: str, content: bytes) -> None:
         with tempfile.TemporaryDirectory() as folder:
@@ -215,45 +224,94 @@ class Workspace:
         self._concepts[request.id] = replace(known, name=name, concept=concept, learned=learned)
 
     def learn(self, request: requests.Learn, tell: Tell, stopped: Callable[[], bool]) -> None:
-        """Learn a concept from the demonstrations, and report loss and samples meanwhile by ``tell``. Raise UserError if there are
-        none or they cannot be learned from, and Stopped if no client waits.
+        """Learn a concept quickly, and report loss and samples meanwhile by ``tell``; or learn it again, see
+        :class:`~ftl_lightning.apps.play.requests.Learn`.
+
+        Args:
+            stopped: called after each step; whether no client waits.
+
+        Raises:
+            UserError: if there are no demonstrations or they cannot be learned from.
+            Stopped: if no client waits, or the concept that is learned again has been removed.
         """
+        if request.again:
+            return self._learn_again(request.again, tell, stopped)
         name = " ".join(request.name.split())
-        demonstrations, begin = self._demonstrating.together(name), monotonic()
-        changes, steps = self._settings(request.quick)
+        demonstrations, task, begin = self._demonstrating.together(name), self._demonstrating.task, monotonic()
+        changes, steps = self._settings(True)
         due, reported = begin + FIRST, begin
 
         def watch(now: Learning) -> None:
             nonlocal due, reported
-            if stopped():
-                raise Stopped
             if (clock := monotonic()) >= reported + REPORT or now.step in (1, steps):
                 tell({"step": now.step, "steps": steps, "loss": round(now.loss, 5)})
                 reported = clock
             if clock >= due:
-                tell({"step": now.step, "samples": self._samples(now.so_far(), SHOWN_FIRST, demonstrations)[0]})
+                tell({"step": now.step, "samples": self._samples(now.so_far(), SHOWN_FIRST, demonstrations, task)[0]})
                 due = monotonic() + max(INTERVAL, RATIO * (monotonic() - clock))
+
+        concept = self._invert(demonstrations, changes, steps, stopped, watch)
+        self._count += 1
+        learned = self._newest = Learned(name, self._unused(name), changes, self._changed(steps))
+        known, found = self._measured(Known(name, "learned", concept, concept.concept, "", learned, demonstrations, task), concept)
+        more = self._settings(False) != (changes, steps)
+        tell(self._keep(f"l{self._count}", known) | found | {"seconds": round(monotonic() - begin, 2), "more": more})
+
+    def _learn_again(self, key: str, tell: Tell, stopped: Callable[[], bool]) -> None:
+        """Learn a concept in the form that its demonstrations select. It replaces the former concept unless this has the same form,
+        or more right samples.
+        """
+        (_, _, demonstrations), begin = self._learned_here(key), monotonic()
+        changes, steps = self._settings(False)
+        concept = self._invert(demonstrations, changes, steps, lambda: stopped() or key not in self._concepts)
+        before, former, _ = self._learned_here(key)  # it may have been renamed meanwhile
+        content = replace(concept.concept, origin=replace(concept.concept.origin, name=before.name))
+        learned = replace(former, changes=changes, steps=self._changed(steps))
+        known, found = self._measured(replace(before, composition=concept, concept=content, learned=learned), concept)
+        if content.choice and content.choice.form != ONE and (known.accuracy or 0) >= (before.accuracy or 0):
+            self._newest = learned if self._newest is former else self._newest
+            found |= self._keep(key, known)
+        tell({"done": True, "seconds": round(monotonic() - begin, 2)} | found)
+
+    def _invert(
+        self,
+        demonstrations: Demonstrations,
+        changes: Mapping[str, Any],
+        steps: int,
+        stopped: Callable[[], bool],
+        watch: Callable[[Learning], None] | None = None,
+    ) -> LearnedConcept:
+        def advance(steps: int = 1, note: str = "") -> None:
+            if stopped():
+                raise Stopped
 
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the page shows these warnings beside the demonstrations
-            concept = self._model.learn(demonstrations, name=name, steps=steps, watch=watch, **changes)
-        seconds = monotonic() - begin
-        self._count += 1
-        changed_steps = None if steps == self._model.tuned.learning_steps else steps
-        key, learned = f"l{self._count}", Learned(name, self._unused(name), changes, changed_steps)
-        known = Known(name, "learned", concept, concept.concept, learned=learned, demonstrations=demonstrations)
-        shown, right = self._samples(concept, GENERATED, demonstrations)
-        quality: Json = {"line": right, "numbers": {}}
-        if len(demonstrations) > 1:
-            measured = concept.quality.quality
-            quality = {"line": ", ".join(filter(None, (right, measured.words))), "numbers": measured.numbers}
+            name = demonstrations.concepts[0]
+            return self._model.learn(demonstrations, name=name, steps=steps, progress=advance, watch=watch, **changes)
+
+    def _changed(self, steps: int) -> int | None:
+        """Number of steps, ``None`` for the tuned number."""
+        return None if steps == self._model.tuned.learning_steps else steps
+
+    def _measured(self, known: Known, concept: LearnedConcept) -> tuple[Known, Json]:
+        """A learned concept with its accuracy, and its samples and quality."""
+        assert known.learned is not None
+        assert known.demonstrations is not None
+        shown, words = self._samples(concept, GENERATED, known.demonstrations, known.task)
         decided = [film["right"] for film in shown if film["right"] is not None]
-        self._concepts[key] = replace(known, accuracy=sum(decided) / len(decided) if decided else None)
-        self._newest = learned
-        concepts = self._listed()
-        result = {"done": True, "concept": concepts[-1], "concepts": concepts, "quality": quality}
-        same = self._same((Part(learned.label, learned=learned),), None)
-        tell({**result, "samples": shown[:SHOWN], "seconds": round(seconds, 2), "same": same})
+        quality: Json = {"line": words, "numbers": {}}
+        if len(known.demonstrations) > 1:
+            measured = concept.quality.quality
+            quality = {"line": ", ".join(filter(None, (words, measured.words))), "numbers": measured.numbers}
+        same = self._same((Part(known.learned.label, learned=known.learned),), None)
+        right = sum(decided) / len(decided) if decided else None
+        return replace(known, accuracy=right), {"samples": shown[:SHOWN], "quality": quality, "same": same}
+
+    def _keep(self, key: str, known: Known) -> Json:
+        """Keep a learned concept under an identifier."""
+        self._concepts[key] = known
+        return {"done": True, "concept": self._content(key), "concepts": self._listed()}
 
     def _unused(self, name: str) -> str:
         """Label whose files and variable differ from those of every concept learned here."""
@@ -291,9 +349,9 @@ class Workspace:
         shown, verdict, how = samples(self._model, mixed, names, examples, request, self._demonstrating.task)
         return {"samples": shown, "told": verdict, "seconds": round(monotonic() - begin, 3), "same": self._same(parts, how)}
 
-    def _samples(self, concept: LearnedConcept, count: int, demonstrations: Demonstrations) -> tuple[list[Json], str]:
+    def _samples(self, concept: LearnedConcept, count: int, demonstrations: Demonstrations, task: str) -> tuple[list[Json], str]:
         """Films of samples of a newly learned concept, and the fraction of correct samples in words."""
-        task, starts = starts_of(self._model, (self._demonstrating.task,), count, 0)
+        task, starts = starts_of(self._model, (task,), count, 0)
         plans = self._model.sample(concept, count, starts, seed=0, **sampling_of(self._model))
         judge = judge_of(self._model, [demonstrations])
         return judged(self._model.model, judge, plans, goal_of(judge, (concept.concept.origin.name,), task))

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from ftl_lightning.apps.play.workspace import Workspace
+from ftl_lightning.igm.settings import PAPER
 from tests.apps.play.conftest import files_of
 from tests.apps.play.served import Served
 
@@ -149,6 +150,21 @@ def test_floods_are_answered(scenes: Served) -> None:
     assert set(found) <= {0, 200, 403, 429, 503}
     assert found.count(200) > 10
     answers(scenes)
+
+
+def test_others_are_answered_while_a_concept_is_learned_again(scenes: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Workspace, "_settings", lambda self, quick: ({"form": PAPER}, 5) if quick else ({"tolerance": None}, 10**6))
+    scenes.post("/api/draw", {"task": "circle above square", "count": 3})
+    last = scenes.learn("quick")[-1]
+    assert last["more"]
+    key = last["concept"]["id"]
+    with ThreadPoolExecutor(1) as pool:
+        again = pool.submit(scenes.ask, "POST", "/api/learn", json.dumps({"again": key}))
+        for _ in range(3):
+            answers(scenes)  # the steps alone would take hours
+        scenes.post("/api/forget", {"id": key})
+        status, content, _ = again.result(timeout=60)
+    assert (status, content) == (200, b"")
 
 
 def test_whoever_leaves_in_the_middle_of_learning_stops_it(scenes: Served, monkeypatch: pytest.MonkeyPatch) -> None:

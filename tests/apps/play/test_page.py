@@ -3,6 +3,7 @@
 import itertools
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -11,6 +12,8 @@ pytest.importorskip("selenium", reason="selenium is not installed")
 from selenium.webdriver.common.keys import Keys
 
 from ftl_lightning.apps.play import workspace
+from ftl_lightning.apps.play.workspace import Workspace
+from ftl_lightning.igm.settings import PAPER
 from tests.apps.play.browser import Browser
 from tests.apps.play.served import Served, here
 
@@ -86,6 +89,24 @@ def test_five_arrangements_become_a_concept(page: Browser, monkeypatch: pytest.M
     assert "invert" in page.text("command")
     assert not page.errors()
     check_names(page)
+
+
+def test_a_concept_is_learned_more_thoroughly_by_itself(page: Browser, monkeypatch: pytest.MonkeyPatch) -> None:
+    def settings(of: Workspace, quick: bool) -> tuple[dict[str, Any], int]:
+        return ({"form": PAPER}, 1) if quick else ({"form": "auto"}, 30)
+
+    monkeypatch.setattr(Workspace, "_settings", settings)
+    page.js("(document.getElementById('ways').open = true)")
+    page.click("draw")
+    page.until(lambda: page.data("again") == "yes")
+    key = page.js("learning.concept.id")
+    assert "more thoroughly" in page.text("waiting")
+    page.until(lambda: page.data("again") == "no")
+    assert page.text("waiting").endswith("seconds.")  # better than after one step
+    assert page.js("learning.concept.id") == key
+    assert "one set" not in page.js("conceptOf(learning.concept.id).form")
+    page.until(lambda: "form='auto'" in page.text("python"))
+    assert not page.errors()
 
 
 def test_a_slider_changes_the_samples(page: Browser) -> None:

@@ -95,7 +95,6 @@ def test_pictures_of_concepts_are_those_of_the_model(page: Browser) -> None:
 def test_choices_are_those_of_the_model(page: Browser) -> None:
     choose(page, "agent")
     page.click("execute")
-    page.click("careful")
     page.js("(find('starts').selectedIndex = 1)")
     put(page, "count", 4, "change")
     choose(page, "strokes")
@@ -105,10 +104,8 @@ def test_choices_are_those_of_the_model(page: Browser) -> None:
     assert page.count("#sought") == 1  # what hides concepts is never hidden itself
     choose(page, "agent")
     assert page.count("#concepts .pick") == len(page.js("state.concepts"))
-    found = page.js(
-        "[find('sought').value, find('execute').checked, find('careful').checked, find('starts').value, find('count').value]"
-    )
-    assert found == ["", False, False, "", "8"]
+    found = page.js("[find('sought').value, find('execute').checked, find('starts').value, find('count').value]")
+    assert found == ["", False, "", "8"]
     assert page.count("#mixed canvas") == 8
 
 

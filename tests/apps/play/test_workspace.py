@@ -5,6 +5,7 @@ import copy
 import json
 import runpy
 import shlex
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -154,6 +155,47 @@ def test_two_learned_concepts_are_mixed(after: Workspace, key: str, monkeypatch:
     mixed = after.sample(requests.Sample(parts, count=2))
     assert len(mixed["samples"]) == 2
     assert "0.5 * square_diagonal_to_triangle + 0.5 * another" in mixed["same"]["python"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("accuracy", "better"), [(0.0, True), (1.1, False)])
+def test_learning_again_replaces_what_is_not_better(
+    after: Workspace, key: str, accuracy: float, better: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Workspace, "_settings", lambda self, quick: ({"form": "auto"}, 10))
+    after.rename(requests.Renamed(key, "mine"))
+    known = after._concepts[key] = replace(after._concepts[key], accuracy=accuracy)
+    told: list[Json] = []
+    after.learn(requests.Learn(again=key), told.append, lambda: False)
+    (last,) = told
+    now = after._concepts[key]
+    assert ("concept" in last) == better
+    assert (now is known) != better
+    assert now.name == "mine"
+    if better:
+        assert last["concept"] in last["concepts"]
+        assert last["concept"]["form"] not in ("", "one set")
+        assert saved(after, key, Path("again.safetensors")).origin.name == "mine"
+        assert "form='auto'" in after.work()["same"]["python"]
+
+
+def test_learning_again_in_the_same_form_changes_nothing(after: Workspace, key: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Workspace, "_settings", lambda self, quick: ({"form": PAPER}, 5))
+    known = after._concepts[key]
+    after.learn(requests.Learn(again=key), lambda line: None, lambda: False)
+    assert after._concepts[key] is known
+    with pytest.raises(UserError, match="id: expected a concept that was learned here, found 'circle right"):
+        after.learn(requests.Learn(again="t0"), lambda line: None, lambda: False)
+
+
+def test_learning_again_ends_with_the_concept(after: Workspace, key: str) -> None:
+    def forgotten() -> bool:
+        if key in after._concepts:
+            after.forget(requests.Named(key))
+        return False
+
+    with pytest.raises(Stopped):
+        after.learn(requests.Learn(again=key), lambda line: None, forgotten)
 
 
 def test_changes_of_demonstrations_can_be_undone(opened: Workspace) -> None:
