@@ -394,17 +394,43 @@ def _recognised(examples: Demonstrations, horizon: int, number: float) -> Metric
     return Metric(measure, identity=examples.hash, calibration=calibration)
 
 
-def _nearest(name: str, examples: Demonstrations, number: float, distances: Callable[[Tensor], Tensor]) -> Metric:
-    """Whether most of the ``number`` nearest examples, by ``distances: states (n, ...) -> (n, example)``, are of the goal."""
+MOST_COMPARED = 20
+"""Maximum number of demonstrations of a concept that are compared with the others."""
+
+
+def _nearest(name: str, examples: Demonstrations, horizon: int, number: float, distances: Callable[[Tensor], Tensor]) -> Metric:
+    """Whether most of the ``number`` nearest examples, by ``distances: states (n, ...) -> (n, example)``, are of the goal.
+
+    NaN for a goal whose own demonstrations are not recognised by the others, such as a known concept by another name.
+    """
     require(number >= 1, f"data.metrics.{name}", "1 or more neighbours", f"{number:g}")
     count = min(int(number), len(examples))
 
-    def measure(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
+    def mostly(rows: list[int], apart: Tensor) -> Tensor:
         of_goal = torch.zeros(len(examples), dtype=torch.bool)
-        of_goal[_goal_rows(examples, goal)] = True
-        return of_goal[distances(states).topk(count, largest=False).indices].float().mean(dim=1) > 0.5
+        of_goal[rows] = True
+        return of_goal[apart.topk(count, largest=False).indices].float().mean(dim=1) > 0.5
 
-    return Metric(measure, identity=examples.hash)
+    @cache
+    def like_another(goal: str) -> bool:
+        rows = _goal_rows(examples, goal)
+        some = rows[:MOST_COMPARED]
+        apart = distances(_cut(examples.states[some], horizon))
+        apart[torch.arange(len(some)), some] = torch.inf
+        return len(rows) > count and bool(mostly(rows, apart).float().mean() <= 0.5)
+
+    def measure(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
+        return _not_measured(goal, states, starts) if like_another(goal) else mostly(_goal_rows(examples, goal), distances(states))
+
+    def calibration(goal: str) -> str:
+        return f"{name} is not measured: demonstrations of {goal!r} are like those of other concepts" if like_another(goal) else ""
+
+    return Metric(measure, identity=examples.hash, calibration=calibration)
+
+
+def _cut(states: Tensor, horizon: int) -> Tensor:
+    """States ``(n, horizon, state)`` of behaviour of any length: cut, or continued by its last state."""
+    return states[:, torch.arange(horizon).clamp(max=states.shape[1] - 1)]
 
 
 def _nearest_demonstration(examples: Demonstrations, horizon: int, number: float) -> Metric:
@@ -413,13 +439,12 @@ def _nearest_demonstration(examples: Demonstrations, horizon: int, number: float
     def distances(states: Tensor) -> Tensor:
         return warped_distances(_scaled(examples, states), _whole(states), known, lengths)
 
-    return _nearest("nearest_demonstration", examples, number, distances)
+    return _nearest("nearest_demonstration", examples, horizon, number, distances)
 
 
 def _nearest_shape(examples: Demonstrations, horizon: int, number: float) -> Metric:
-    times = torch.arange(horizon).clamp(max=examples.states.shape[1] - 1)
-    known = _shapes(examples.states[:, times])
-    return _nearest("nearest_shape", examples, number, lambda states: torch.cdist(_shapes(states), known))
+    known = _shapes(_cut(examples.states, horizon))
+    return _nearest("nearest_shape", examples, horizon, number, lambda states: torch.cdist(_shapes(states), known))
 
 
 def _shapes(states: Tensor) -> Tensor:

@@ -220,6 +220,18 @@ def test_most_of_the_nearest_demonstrations_decide() -> None:
             METRICS[name](known, TIME, 0)
 
 
+def test_a_known_concept_by_another_name_is_not_judged() -> None:
+    known = examples(go_right=walks("go right", 40), go_right_2=walks("go right", 6, 1), go_up=walks("go up", 6, 2))
+    plans = torch.from_numpy(walks("go right", 3, 7)).float()
+    for name in ("nearest_demonstration", "nearest_shape"):
+        metric = METRICS[name](known, TIME, 1)
+        assert metric.calibration is not None
+        assert metric.measure("go right 2", plans, None).isnan().all()
+        assert "of 'go right 2' are like those of other concepts" in metric.calibration("go right 2")
+        assert metric.measure("go up", plans, None).dtype == torch.bool
+        assert not metric.calibration("go up")
+
+
 def test_a_shape_is_known_wherever_it_is_and_whatever_its_size() -> None:
     time = np.linspace(0, 1, TIME)
     bow, line = np.stack((time, time * (1 - time)), axis=-1), np.stack((time, time), axis=-1)
