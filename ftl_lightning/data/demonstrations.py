@@ -70,6 +70,7 @@ FORMATS: dict[str, Format] = {}
 def read_contents(path: str | Path) -> Contents:
     """Read attributes of demonstrations from a ``path`` as in :meth:`Demonstrations.load`, without validating them."""
     kind, name = read_from(str(path))
+    require(kind != "folder", name, "a file of demonstrations", "a folder; only fit reads folders of files")
     contents = _format(kind, name).read(name)
     foreign = next((text for text in contents["state_kinds"] if (text.split() or [KINDS[0]])[0] not in KINDS), "")
     require(not foreign, f"{name}: key 'state_kinds'", f"one of {', '.join(KINDS)}", repr(short(foreign)))

@@ -39,11 +39,13 @@ from ftl_lightning.data.distances import warped_distances
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.data.kinds import LINEAR, Columns, check_values, declared, resolved
 from ftl_lightning.data.places import objects, places
+from ftl_lightning.data.shards import Shards
 from ftl_lightning.domains.comparison import Comparison
 from ftl_lightning.domains.domain import OWN, Concepts, Domain, Metric, Plans, Recordings, Split, View
 from ftl_lightning.domains.recognition import Recognition
 from ftl_lightning.domains.recorder import drawn_by_hand
 from ftl_lightning.services.errors import about, note, require, short
+from ftl_lightning.services.files import read_from
 from ftl_lightning.services.randomness import generator, task_key
 from ftl_lightning.services.spectrum import check_cosines
 
@@ -55,10 +57,14 @@ RECOGNISED, CALIBRATED = "recognised", 10
 
 @dataclass(frozen=True)
 class FileSource:
-    """Source that splits the demonstrations of a file by the mask ``held_out (demo,)`` of the validation split."""
+    """Source that splits the demonstrations of a file by the mask ``held_out (demo,)`` of the validation split.
+
+    For a folder of files, ``demonstrations`` are the sample of ``shards``.
+    """
 
     demonstrations: Demonstrations
     held_out: Tensor
+    shards: Shards | None = None
 
     def split(self, name: Split, count: int, seed: int) -> Demonstrations:
         """All demonstrations of a split; ``count`` and ``seed`` are ignored."""
@@ -267,7 +273,7 @@ def domain_from_file(
     """Domain of a file.
 
     Args:
-        path: the file, the folder of a LeRobot data set, or the name of an installed Minari data set.
+        path: the file, a folder of files, the folder of a LeRobot data set, or the name of an installed Minari data set.
         horizon: states in a plan; ``None`` for the length of the longest demonstration, or :data:`WINDOW` if it is longer than
             :data:`LONGEST_PLAN`. Plans of data with actions that are whole demonstrations use features at the first time alone.
         metrics: see :func:`own_domain`.
@@ -278,7 +284,8 @@ def domain_from_file(
     Raises:
         UserError: naming the file, if it has no texts, fewer than two concepts, or a concept with a single demonstration.
     """
-    demonstrations = of_kinds(read_own(path), kinds or {}, path)
+    shards = Shards.of(path, read_own) if read_from(path)[0] == "folder" else None
+    demonstrations = of_kinds(read_own(path) if shards is None else shards.sample, kinds or {}, path)
     with about(path):
         check_precision(demonstrations)
     rows_of = demonstrations.rows_of
@@ -309,7 +316,7 @@ def domain_from_file(
     if acts and longest <= (horizon or usual):
         demonstrations = demonstrations.at_start
         note(f"{path}: plans are whole demonstrations, which follow the places {short(', '.join(followed), 80) or 'none'}")
-    source = FileSource(demonstrations, held_out)
+    source = FileSource(demonstrations, held_out, shards)
     return own_domain(source.split("validation", 0, 0), tuple(rows_of), horizon or usual, metrics, source)
 
 

@@ -166,8 +166,8 @@ def _check_place(folder: Path, path: Path, key: str) -> None:
         raise UserError(f"{_named(path, key)}: cannot be written ({message}); choose a writable place with room") from error
 
 
-Kind = Literal["file", "minari", "lerobot"]
-"""Kind of demonstrations: a file, a Minari data set, or a folder that is a LeRobot data set."""
+Kind = Literal["file", "folder", "minari", "lerobot"]
+"""Kind of demonstrations: a file, a folder of files, a Minari data set, or a folder that is a LeRobot data set."""
 MINARI = re.compile(r"[\w./-]+-v\d+")
 """Pattern of names of Minari data sets."""
 INFO = Path("meta") / "info.json"
@@ -180,8 +180,8 @@ def read_from(name: str) -> tuple[Kind, str]:
     """Resolve a name of demonstrations to read: their kind, and the name of the data set, the folder or the file.
 
     Args:
-        name: ``'minari:NAME'``, ``'lerobot:FOLDER'``, a folder with :data:`INFO`, the name of a Minari data set unless a file has
-            it, or a file.
+        name: ``'minari:NAME'``, ``'lerobot:FOLDER'``, a folder (of a LeRobot data set if it has :data:`INFO`), the name of a Minari
+            data set unless a file has it, or a file.
     """
     kind, rest = written_to(name)
     if kind != "file" or Path(name).suffix in FILES:
@@ -189,6 +189,8 @@ def read_from(name: str) -> tuple[Kind, str]:
     try:
         if (Path(name) / INFO).is_file():
             return "lerobot", name
+        if Path(name).is_dir():
+            return "folder", name
         exists = Path(name).exists()
     except (OSError, ValueError):  # an invalid path, reported when it is opened
         return "file", name

@@ -18,11 +18,12 @@ from ftl_lightning.data.actions import PRESENT
 from ftl_lightning.data.check import check_each
 from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.data.features import check_features
+from ftl_lightning.data.shards import TOGETHER, Stream
 from ftl_lightning.domains.domain import OWN, Domain, Recoveries
 from ftl_lightning.domains.from_file import RECOGNISED, FileSource, domain_from_file, read_demonstrations, read_own
 from ftl_lightning.domains.registry import load_domain, recorded_name
 from ftl_lightning.networks.text_encoder import Encoder, load_encoder
-from ftl_lightning.services.errors import UserError, note, require, short
+from ftl_lightning.services.errors import UserError, about, note, require, short
 from ftl_lightning.services.modes import single_precision
 from ftl_lightning.services.randomness import DEMONSTRATION_SEED, drawn, generator, rows_of
 from ftl_lightning.services.text import alike
@@ -195,10 +196,10 @@ class PretrainingData(pl.LightningDataModule):
                 rows = drawn(count, lambda n: torch.randint(len(self.training), (n,), generator=draw))
             else:
                 rows = drawn(count, lambda n: torch.multinomial(self._shares, n, replacement=True, generator=draw))
-            return self._windows(self.training, rows, draw)
+            return self._windows(self.training, rows, _even(rows, draw))
 
-    def _windows(self, demonstrations: Demonstrations, rows: Tensor, draw: torch.Generator) -> Batch:
-        share = drawn(len(rows), lambda n: torch.rand(n, generator=draw))
+    def _windows(self, demonstrations: Demonstrations, rows: Tensor, share: Tensor) -> Batch:
+        """Windows of demonstrations ``rows (window,)``, whose starts are spread by ``share (window,)`` from 0 to 1."""
         starts = demonstrations.starts(rows, share, self.start_exponent, self.horizon, self.domain.plans.at_rest)
         states, observed = demonstrations.windows(rows, starts, self.horizon)
         return Batch(states, self._concepts(demonstrations, rows), observed)
@@ -210,7 +211,7 @@ class PretrainingData(pl.LightningDataModule):
     def some_windows(self, count: int) -> Batch:
         """At least ``count`` pretraining windows, equally many per demonstration."""
         rows = torch.arange(len(self.training)).repeat(-(-count // len(self.training)))
-        return self._windows(self.training, rows, generator("cpu", self.seed))
+        return self._windows(self.training, rows, _even(rows, generator("cpu", self.seed)))
 
     def every_window(self) -> Batch:
         """A window from every possible start of every demonstration."""
@@ -236,10 +237,15 @@ class PretrainingData(pl.LightningDataModule):
     @single_precision()
     def val_dataloader(self) -> DataLoader[Batch]:
         rows = torch.arange(len(self.validation))
-        batch = self._windows(self.validation, rows, generator("cpu", self.seed))
+        batch = self._windows(self.validation, rows, _even(rows, generator("cpu", self.seed)))
         return DataLoader([batch], batch_size=None)  # type: ignore[arg-type]
 
     test_dataloader = val_dataloader
+
+
+def _even(rows: Tensor, draw: torch.Generator) -> Tensor:
+    """A random share from 0 to 1 for each row ``(window,)``."""
+    return drawn(len(rows), lambda n: torch.rand(n, generator=draw))
 
 
 MOST_HISTORY = 16
@@ -254,8 +260,8 @@ class OwnData(PretrainingData):
 
     Args:
         demonstrations: the file (``.npz`` or safetensors), see
-            :meth:`ftl_lightning.data.demonstrations.Demonstrations.load`; or the folder of a LeRobot data set, or the name of
-            an installed Minari data set.
+            :meth:`ftl_lightning.data.demonstrations.Demonstrations.load`; a folder of such files, see
+            :mod:`ftl_lightning.data.shards`; the folder of a LeRobot data set, or the name of an installed Minari data set.
         metrics: metrics of plans, number by name, see :mod:`ftl_lightning.domains.from_file`; empty for none.
         kinds: kinds of columns by name, such as ``{heading: angle}``, see :mod:`ftl_lightning.data.kinds`; other columns have the
             kind that the file declares or the data show.
@@ -291,6 +297,7 @@ class OwnData(PretrainingData):
         self._file, self._share, self._metrics, self._horizon = demonstrations, validation_share, dict(metrics or {}), horizon
         check_count("data.history", history, 1, MOST_HISTORY)
         self._kinds, self._check, self._history = dict(kinds or {}), check, history
+        self._stream: Stream | None = None
         super().__init__(
             domain=OWN,
             seed=seed,
@@ -317,12 +324,48 @@ class OwnData(PretrainingData):
 
     def setup(self, stage: str) -> None:
         super().setup(stage)
+        source = self.domain.source(None)
+        assert isinstance(source, FileSource)
+        if source.shards is not None:
+            held: dict[int, frozenset[int]] = {}
+            for (number, row), out in zip(source.shards.origins, source.held_out.tolist(), strict=True):
+                held[number] = held.get(number, frozenset()) | ({row} if out else frozenset())
+            self._stream = Stream(source.shards, self._opened, held, self.seed)
+            note(f"{self._file}: {source.shards.about}; windows come from {TOGETHER} files at a time")
         if stage == "fit" and RECOGNISED in self.metrics:
             text = calibration_of(self.domain, self.domain.concepts.training[0], RECOGNISED)
             note(f"{self._file}: {text if text.startswith(RECOGNISED) else f'{RECOGNISED} {text}'}")
         if self._check and stage == "fit":
             for text in check_each(self.training):
                 note(f"{self._file}: {text}; --data.check false turns this off")
+
+    def _opened(self, path: str) -> Demonstrations:
+        with about(path):
+            fitted = self.domain.fitted(read_own(path))
+        for text in set(fitted.concepts) - set(self._number):
+            raise UserError(f"{path}: expected the texts that the file had before, found {text!r}, too; did the file change?")
+        return fitted
+
+    @single_precision()
+    def batch(self, step: int) -> Batch:
+        """Batch of a step; of a folder of files, windows of demonstrations of a few files, equally likely."""
+        if self._stream is None:
+            return super().batch(step)
+        draw, parts = generator("cpu", self.seed, step), self._stream.at(step)
+        ends = torch.tensor([len(part) for part in parts]).cumsum(dim=0)
+        with rows_of(*((0, 1) if self.trainer is None else (self.trainer.global_rank, self.trainer.world_size))):
+            rows = drawn(self.batch_size, lambda n: torch.randint(int(ends[-1]), (n,), generator=draw))
+            share = _even(rows, draw)
+        own = torch.bucketize(rows, ends, right=True)
+        batches = [
+            self._windows(part, rows[own == number] - int(ends[number]) + len(part), share[own == number])
+            for number, part in enumerate(parts)
+            if (own == number).any()
+        ]
+        states, concepts = torch.cat([batch.states for batch in batches]), torch.cat([batch.concepts for batch in batches])
+        return Batch(
+            states, concepts, {name: torch.cat([batch.observed[name] for batch in batches]) for name in batches[0].observed}
+        )
 
     @property
     def view(self) -> str:

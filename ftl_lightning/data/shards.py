@@ -1,0 +1,138 @@
+"""Demonstrations in a folder of files, which together may be larger than memory.
+
+A sample of all files decides kinds of columns, scales and validation; training windows come from a few files at a time.
+"""
+
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from ftl_lightning.data.demonstrations import Demonstrations, concatenate
+from ftl_lightning.services.errors import UserError, require
+from ftl_lightning.services.files import FILES
+from ftl_lightning.services.progress import bar
+from ftl_lightning.services.randomness import generator
+
+SAMPLE = 2**24
+"""Bytes of the states in the sample, without padding."""
+TOGETHER, STEPS = 4, 20
+"""Number of files in memory, and of training steps after which one of them is replaced by the next."""
+ORDER = 17
+"""Seed of the order of the files."""
+FEWEST = 2
+"""Minimum number of demonstrations of each concept in the sample, where there are as many."""
+
+
+@dataclass(frozen=True)
+class Shards:
+    """Files of demonstrations with the same columns and observed features.
+
+    Attributes:
+        paths: the files.
+        sample: demonstrations of all files, evenly spaced in each, with the longest of each file.
+        origins: file and row of each demonstration of the sample.
+        demonstrations: number in all files.
+    """
+
+    paths: tuple[str, ...]
+    sample: Demonstrations
+    origins: tuple[tuple[int, int], ...]
+    demonstrations: int
+
+    @classmethod
+    def of(cls, folder: str, read: Callable[[str], Demonstrations]) -> "Shards":
+        """Read all files of a folder, one at a time.
+
+        Raises:
+            UserError: if there are none, or naming the file, if it is damaged or its columns are not those of the first file.
+        """
+        paths = [str(path) for path in sorted(Path(folder).iterdir()) if path.suffix.lower() in FILES and path.is_file()]
+        require(paths, folder, f"files of demonstrations ({', '.join(FILES)})", "none")
+        parts, origins, counts, total = list[Demonstrations](), list[tuple[int, int]](), dict[str, int](), 0
+        with bar(f"reading {len(paths)} files of {folder}", len(paths)) as advance:
+            for number, path in enumerate(paths):
+                found = read(path)
+                if parts:
+                    _check_alike(path, found, paths[0], parts[0])
+                rows = _spread(found, SAMPLE // len(paths), counts)
+                parts.append(found.rows(rows))
+                origins += [(number, row) for row in rows]
+                total += len(found)
+                advance()
+        return cls(tuple(paths), concatenate(parts), tuple(origins), total)
+
+    @property
+    def about(self) -> str:
+        """Number of files and of demonstrations, in words."""
+        return f"{self.demonstrations:,} demonstrations in {len(self.paths):,} files"
+
+
+def _check_alike(path: str, found: Demonstrations, first: str, known: Demonstrations) -> None:
+    for key, some, other in (
+        ("state_names", found.state_names, known.state_names),
+        ("state_units", found.state_units, known.state_units),
+        ("state_kinds", found.state_kinds, known.state_kinds),
+        ("per_step", found.per_step, known.per_step),
+        ("observed", _words(found), _words(known)),
+    ):
+        if some != other:
+            raise UserError(f"{path}: key {key!r}: expected those of {first}, {list(other)}, found {list(some)}")
+
+
+def _words(demonstrations: Demonstrations) -> tuple[str, ...]:
+    return tuple(f"{name}: {feature.words}" for name, feature in sorted(demonstrations.features.items()))
+
+
+def _spread(found: Demonstrations, size: int, counts: dict[str, int]) -> list[int]:
+    """Evenly spaced rows of about ``size`` bytes, the longest, and the first of concepts that have few by ``counts``."""
+    width = found.states.shape[2] * found.states.element_size()
+    wanted = min(len(found), max(1, round(size / (float(found.lengths.double().mean()) * width))))
+    rows = {*torch.linspace(0, len(found) - 1, wanted).round().long().tolist(), int(found.lengths.argmax())}
+    for row, text in enumerate(found.concepts):
+        if row in rows or counts.get(text, 0) < FEWEST:
+            rows.add(row)
+            counts[text] = counts.get(text, 0) + 1
+    return sorted(rows)
+
+
+class Stream:
+    """A few files at a time, in an order that depends on the seed alone; the next file is read in the background.
+
+    Args:
+        shards: all files.
+        read: reads a file.
+        excluded: rows of files, by the file's number, that are not for training.
+    """
+
+    def __init__(
+        self, shards: Shards, read: Callable[[str], Demonstrations], excluded: Mapping[int, frozenset[int]], seed: int
+    ) -> None:
+        self._shards, self._read, self._excluded, self._seed = shards, read, excluded, seed
+        self._files: dict[int, Future[Demonstrations]] = {}
+        self._reader = ThreadPoolExecutor(1)
+
+    def at(self, step: int) -> list[Demonstrations]:
+        """Training demonstrations of the files of a training step."""
+        count = len(self._shards.paths)
+        if count <= TOGETHER:
+            wanted, later = [*range(count)], []
+        else:
+            place = step // STEPS
+            *wanted, last = (self._file(place + offset) for offset in range(TOGETHER + 1))
+            later = [last]
+        needed = dict.fromkeys([*wanted, *later])
+        self._files = {number: self._files.get(number) or self._reader.submit(self._opened, number) for number in needed}
+        return [self._files[number].result() for number in dict.fromkeys(wanted)]
+
+    def _file(self, place: int) -> int:
+        """Number of the file at a place of the endless order, in which all files come before one comes again."""
+        count = len(self._shards.paths)
+        order = torch.randperm(count, generator=generator("cpu", self._seed, place // count, ORDER))
+        return int(order[place % count])
+
+    def _opened(self, number: int) -> Demonstrations:
+        found, excluded = self._read(self._shards.paths[number]), self._excluded.get(number, frozenset())
+        return found.rows([row for row in range(len(found)) if row not in excluded]) if excluded else found
