@@ -2,8 +2,8 @@
 
     python benchmarks/speed/large.py [--decades 5 6 7 8] [--steps 300] [--folder FOLDER] [--out results/large.json]
 
-Seconds are of the processor. Each size is pretrained in its own process, with one thread: ``fit --config conf/own.yaml`` on windows of 64 steps of random
-walks, in files of 2 * 10^5 steps or of a tenth of all. The files are removed afterwards; 10^8 steps need 6.4 GB.
+Seconds are of the processor. Each size is pretrained in its own process, with one thread: ``fit --config conf/own.yaml`` on windows
+of 64 steps of random walks, in files of 2 * 10^5 steps or of a tenth of all. The files are removed afterwards; 10^8 steps need 6.4 GB.
 """
 
 import argparse
@@ -53,8 +53,8 @@ def fitted(folder: str, steps: int, model: str) -> dict[str, float]:
 
     before, begin = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.process_time()
     data = OwnData(folder, metrics={}, check=False, encoder="hashing", horizon=HORIZON)
-    options = {"denoiser_args": {"hidden_dim": 256, "depth": 4, "condition_dim": 384}, "prediction": "cosines"}
-    module = PretrainingModule(**options, output=model)
+    network = {"hidden_dim": 256, "depth": 4, "condition_dim": 384}
+    module = PretrainingModule(denoiser_args=network, prediction="cosines", output=model)
     trainer = Trainer(
         max_steps=steps, accelerator="cpu", logger=False, callbacks=[Clock()], enable_progress_bar=False, enable_checkpointing=False
     )
@@ -74,15 +74,16 @@ def main() -> None:
     parser.add_argument("--fit", nargs=2, help=argparse.SUPPRESS)
     chosen = parser.parse_args()
     if chosen.fit:
-        print(json.dumps(fitted(*chosen.fit[:1], chosen.steps, chosen.fit[1])))
+        folder, model = chosen.fit
+        print(json.dumps(fitted(folder, chosen.steps, model)))
         return
     rows = []
     for decade in chosen.decades:
-        with tempfile.TemporaryDirectory(dir=chosen.folder) as folder:
-            data = Path(folder) / "data"
+        with tempfile.TemporaryDirectory(dir=chosen.folder) as place:
+            data = Path(place) / "data"
             data.mkdir()
             size = write(data, 10**decade)
-            command = [sys.executable, __file__, "--steps", str(chosen.steps), "--fit", str(data), f"{folder}/model"]
+            command = [sys.executable, __file__, "--steps", str(chosen.steps), "--fit", str(data), f"{place}/model"]
             told = subprocess.run(command, check=True, stdout=subprocess.PIPE, env=os.environ | {"OMP_NUM_THREADS": "1"}).stdout
             files = len([*data.glob("*.npz")])
         found = json.loads(told.decode().splitlines()[-1])

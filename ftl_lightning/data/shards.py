@@ -18,7 +18,7 @@ from ftl_lightning.services.randomness import generator
 
 SAMPLE = 2**24
 """Bytes of the states in the sample, without padding."""
-TOGETHER, STEPS = 4, 20
+TOGETHER, STEPS = 4, 50
 """Number of files in memory, and of training steps after which one of them is replaced by the next."""
 ORDER = 17
 """Seed of the order of the files."""
@@ -32,7 +32,7 @@ class Shards:
 
     Attributes:
         paths: the files.
-        sample: demonstrations of all files, evenly spaced in each, with the longest of each file.
+        sample: demonstrations of all files, evenly spaced in each, with the longest.
         origins: file and row of each demonstration of the sample.
         demonstrations: number in all files.
     """
@@ -51,13 +51,14 @@ class Shards:
         """
         paths = [str(path) for path in sorted(Path(folder).iterdir()) if path.suffix.lower() in FILES and path.is_file()]
         require(paths, folder, f"files of demonstrations ({', '.join(FILES)})", "none")
-        parts, origins, counts, total = list[Demonstrations](), list[tuple[int, int]](), dict[str, int](), 0
+        parts, origins, counts, total, longest = list[Demonstrations](), list[tuple[int, int]](), dict[str, int](), 0, 0
         with bar(f"reading {len(paths)} files of {folder}", len(paths)) as advance:
             for number, path in enumerate(paths):
                 found = read(path)
                 if parts:
                     _check_alike(path, found, paths[0], parts[0])
-                rows = _spread(found, SAMPLE // len(paths), counts)
+                rows = _spread(found, SAMPLE // len(paths), counts, longest)
+                longest = max(longest, int(found.lengths.max()))
                 parts.append(found.rows(rows))
                 origins += [(number, row) for row in rows]
                 total += len(found)
@@ -86,11 +87,12 @@ def _words(demonstrations: Demonstrations) -> tuple[str, ...]:
     return tuple(f"{name}: {feature.words}" for name, feature in sorted(demonstrations.features.items()))
 
 
-def _spread(found: Demonstrations, size: int, counts: dict[str, int]) -> list[int]:
-    """Evenly spaced rows of about ``size`` bytes, the longest, and the first of concepts that have few by ``counts``."""
+def _spread(found: Demonstrations, size: int, counts: dict[str, int], longest: int) -> list[int]:
+    """Evenly spaced rows of about ``size`` bytes, one longer than ``longest``, and the first of rare concepts."""
     width = found.states.shape[2] * found.states.element_size()
     wanted = min(len(found), max(1, round(size / (float(found.lengths.double().mean()) * width))))
-    rows = {*torch.linspace(0, len(found) - 1, wanted).round().long().tolist(), int(found.lengths.argmax())}
+    rows = set(torch.linspace(0, len(found) - 1, wanted).round().long().tolist())
+    rows |= {int(found.lengths.argmax())} if int(found.lengths.max()) > longest else set()
     for row, text in enumerate(found.concepts):
         if row in rows or counts.get(text, 0) < FEWEST:
             rows.add(row)

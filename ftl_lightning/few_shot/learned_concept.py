@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ftl_lightning.data.demonstrations import Demonstrations
-from ftl_lightning.domains.domain import Domain
 from ftl_lightning.few_shot.shared_concept import upload, write_folder
 from ftl_lightning.few_shot.tuned import ModelSettings
 from ftl_lightning.igm.composition import Composition
@@ -17,7 +16,7 @@ from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.modes import usual_modes
 from ftl_lightning.services.validation import check_whole
 from ftl_lightning.training.concept_model import ConceptModel
-from ftl_lightning.training.quality import Inspection, inspected
+from ftl_lightning.training.quality import Inspection, inspected, judging_domain
 
 
 @dataclass(frozen=True)
@@ -45,7 +44,7 @@ class LearnedConcept(Composition):
         tuned: the model's settings, for sampling its film.
         known_as: public name of the model: a shipped model or ``'owner/name'`` on the Hub; empty for none.
         demonstrations: its demonstrations, if it was learned in this process.
-        judging: domain that judges its samples, if it was learned in this process.
+        examples: demonstrations with which its samples are compared in data of a user.
     """
 
     concept: Concept
@@ -53,7 +52,7 @@ class LearnedConcept(Composition):
     tuned: ModelSettings
     known_as: str = ""
     demonstrations: Demonstrations | None = None
-    judging: Domain | None = None
+    examples: tuple[Demonstrations, ...] = ()
 
     def _words(self) -> Iterator[str]:
         return self.concept._words()
@@ -73,9 +72,9 @@ class LearnedConcept(Composition):
     @usual_modes()
     def inspection(self) -> Inspection | None:
         """:attr:`quality`; ``None`` where it cannot be measured."""
-        if self.demonstrations is None or self.judging is None:
+        if self.demonstrations is None:
             return None
-        return inspected(self.model, self.judging, self.demonstrations, self.concept)
+        return inspected(self.model, judging_domain(self.model, self.examples), self.demonstrations, self.concept)
 
     @usual_modes()
     def explain(self, nearest: int = 3) -> Explanation:

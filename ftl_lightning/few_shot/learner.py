@@ -383,9 +383,10 @@ class FewShot(Shown):
         shown = bar(title, total) if progress is True else nullcontext(progress or (lambda *_: None))
         with shown as advance:
             learned = self.model.learn_concepts(fitted, settings, total, lambda loss: advance(1, f"loss {loss:.3g}"), watched)
-        self._examples += [fitted.select(name) for name in names]
-        judging = self.judging
-        return [replace(self._learned(learned[name]), demonstrations=fitted.select(name), judging=judging) for name in names]
+        parts = {name: fitted.select(name) for name in names}
+        self._examples += parts.values() if self.model.examples is not None else ()
+        examples = tuple(self._examples)
+        return [replace(self._learned(learned[name]), demonstrations=part, examples=examples) for name, part in parts.items()]
 
     def _watched(self, name: str, watch: Callable[[Learning], None]) -> Watch:
         return lambda step, loss, concepts: watch(Learning(step, loss, lambda: self._learned(concepts()[name])))
