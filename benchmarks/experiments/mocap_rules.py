@@ -68,7 +68,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--root", type=Path, required=True, help="folder of prepared recordings")
     parser.add_argument("--out", type=Path, default=Path("results/mocap_rules.json"))
-    parser.add_argument("--concepts", type=Path, default=Path("results/concepts/mocap"), help="a folder of concepts for each seed")
+    parser.add_argument(
+        "--concepts", type=Path, default=Path("results/concepts/mocap_adapter"), help="a folder of concepts for each seed"
+    )
     chosen = parser.parse_args(arguments)
     source = Recorded(chosen.root)
     training = source.split("train", 0, 0)

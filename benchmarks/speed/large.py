@@ -3,7 +3,8 @@
     python benchmarks/speed/large.py [--decades 5 6 7 8] [--steps 300] [--folder FOLDER] [--out results/large.json]
 
 Seconds are of the processor. Each size is pretrained in its own process, with one thread: ``fit --config conf/own.yaml`` on windows
-of 64 steps of random walks, in files of 2 * 10^5 steps or of a tenth of all. The files are removed afterwards; 10^8 steps need 6.4 GB.
+of 64 steps of random walks, in files of 2 * 10^5 steps or of a tenth of all. The files are removed afterwards; 10^8 steps need
+6.4 GB.
 """
 
 import argparse

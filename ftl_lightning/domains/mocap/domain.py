@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.data.features import InitialStates, Observed, check_starts
-from ftl_lightning.domains.comparison import OURS, WITH_KNOTS, WITH_MODES, Compared, Comparison
+from ftl_lightning.domains.comparison import OURS, WITH_ADAPTER, WITH_KNOTS, WITH_MODES, Compared, Comparison
 from ftl_lightning.domains.domain import ACCURACY, Concepts, Domain, Metric, Plans, Recordings, View, deferred
 from ftl_lightning.domains.mocap.judge import identity
 from ftl_lightning.domains.mocap.skeleton import (
@@ -170,7 +170,7 @@ DOMAIN = Domain(
         exports={".bvh": deferred("ftl_lightning.domains.mocap.bvh:bvh")},
     ),
     comparison=Comparison(
-        ours=Compared(OURS, f"{WITH_MODES} {WITH_KNOTS}"),
+        ours=Compared(OURS, f"{WITH_MODES} {WITH_KNOTS} {WITH_ADAPTER}"),
         headline="rule",
         references={"frozen frame": _frozen},
         fresh=False,  # recordings are finite
