@@ -4,12 +4,13 @@
     python benchmarks/experiments/tabletop_level.py --pretrained logs/tabletop_level/fit/pretrained
 
 The shipped model also sees raised scenes (view ``points``). Closed loop success in the same new scenes: the text of the push on the
-table, the concept learned from ten demonstrations in the paper's form, and with an adapter.
+table, the concept learned from ten demonstrations in the paper's form, with learned weights or not, and with an adapter.
 """
 
 import argparse
 import json
 from pathlib import Path
+from typing import Any
 
 from ftl_lightning.domains.tabletop.interface import PUSH, PUSH_ON_BOOK, TRAINING_CONCEPTS
 from ftl_lightning.few_shot.learner import FewShot
@@ -18,7 +19,11 @@ from ftl_lightning.services.progress import bar
 from ftl_lightning.services.tensor_file import write_text
 
 DEMONSTRATIONS, SCENE_SEED = 10, 5_000_000
-FORMS = {"learned": "conf/tabletop.yaml", "learned, with an adapter": "conf/tabletop_adapter.yaml"}
+FORMS: dict[str, tuple[str, dict[str, Any]]] = {
+    "learned": ("conf/tabletop.yaml", {}),
+    "learned, one component of weight 1": ("conf/tabletop.yaml", {"components": 1, "omega": 1.0}),
+    "learned, with an adapter": ("conf/tabletop_adapter.yaml", {}),
+}
 
 
 def rates(model: FewShot, concept: Composition, goal: str, scenes: int, seed: int) -> dict[str, float]:
@@ -35,7 +40,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="*", default=[0, 1, 2])
     parser.add_argument("--out", type=Path, default=Path("results/tabletop_level.json"))
     chosen = parser.parse_args()
-    models = {name: FewShot.from_pretrained(chosen.pretrained, settings=config) for name, config in FORMS.items()}
+    models = {name: FewShot.from_pretrained(chosen.pretrained, settings=config) for name, (config, _) in FORMS.items()}
     model = models["learned"]
     results: dict[str, object] = {"model": model.model.hash, "scenes": chosen.scenes, "seeds": chosen.seeds}
     with bar("table-top, level", len(chosen.seeds) * (1 + len(models)) + len(TRAINING_CONCEPTS), lines=True) as advance:
@@ -44,7 +49,7 @@ def main() -> None:
             advance()
             for name, form in models.items():
                 demonstrations = form.domain.source(None).draw(PUSH_ON_BOOK, DEMONSTRATIONS, seed)
-                concept = form.learn(demonstrations, name=PUSH_ON_BOOK, seed=seed)
+                concept = form.learn(demonstrations, name=PUSH_ON_BOOK, seed=seed, **FORMS[name][1])
                 measured[name] = rates(form, concept, PUSH_ON_BOOK, chosen.scenes, seed)
                 advance()
             results[f"seed {seed}"] = measured
