@@ -18,7 +18,7 @@ def test_a_name_is_a_file_unless_it_says_or_is_something_else(tmp_path: Path, mo
         "lerobot:any": ("lerobot", "any"),
         "strokes/five-v0": ("minari", "strokes/five-v0"),
         "minari:folder-v1": ("minari", "folder-v1"),
-        "folder-v1": ("file", "folder-v1"),
+        "folder-v1": ("folder", "folder-v1"),
         "file-v1": ("file", "file-v1"),
         "x-v1.npz": ("file", "x-v1.npz"),
         "a:b.npz": ("file", "a:b.npz"),
