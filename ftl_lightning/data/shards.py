@@ -34,13 +34,13 @@ class Shards:
         paths: the files.
         sample: demonstrations of all files, evenly spaced in each, with the longest.
         origins: file and row of each demonstration of the sample.
-        demonstrations: number in all files.
+        sizes: number of demonstrations of each file.
     """
 
     paths: tuple[str, ...]
     sample: Demonstrations
     origins: tuple[tuple[int, int], ...]
-    demonstrations: int
+    sizes: tuple[int, ...]
 
     @classmethod
     def of(cls, folder: str, read: Callable[[str], Demonstrations]) -> "Shards":
@@ -51,7 +51,7 @@ class Shards:
         """
         paths = [str(path) for path in sorted(Path(folder).iterdir()) if path.suffix.lower() in FILES and path.is_file()]
         require(paths, folder, f"files of demonstrations ({', '.join(FILES)})", "none")
-        parts, origins, counts, total, longest = list[Demonstrations](), list[tuple[int, int]](), dict[str, int](), 0, 0
+        parts, origins, counts, sizes, longest = list[Demonstrations](), list[tuple[int, int]](), dict[str, int](), list[int](), 0
         with bar(f"reading {len(paths)} files of {folder}", len(paths)) as advance:
             for number, path in enumerate(paths):
                 found = read(path)
@@ -61,14 +61,14 @@ class Shards:
                 longest = max(longest, int(found.lengths.max()))
                 parts.append(found.rows(rows))
                 origins += [(number, row) for row in rows]
-                total += len(found)
+                sizes.append(len(found))
                 advance()
-        return cls(tuple(paths), concatenate(parts), tuple(origins), total)
+        return cls(tuple(paths), concatenate(parts), tuple(origins), tuple(sizes))
 
     @property
     def about(self) -> str:
         """Number of files and of demonstrations, in words."""
-        return f"{self.demonstrations:,} demonstrations in {len(self.paths):,} files"
+        return f"{sum(self.sizes):,} demonstrations in {len(self.paths):,} files"
 
 
 def _check_alike(path: str, found: Demonstrations, first: str, known: Demonstrations) -> None:
@@ -106,21 +106,21 @@ class Stream:
     Args:
         shards: all files.
         read: reads a file.
-        excluded: rows of files, by the file's number, that are not for training.
+        excluded: rows of files, by the file's number, that are not for training; a file without others is never read.
     """
 
     def __init__(
         self, shards: Shards, read: Callable[[str], Demonstrations], excluded: Mapping[int, frozenset[int]], seed: int
     ) -> None:
         self._shards, self._read, self._excluded, self._seed = shards, read, excluded, seed
+        self._used = [number for number, size in enumerate(shards.sizes) if len(excluded.get(number, ())) < size]
         self._files: dict[int, Future[Demonstrations]] = {}
         self._reader = ThreadPoolExecutor(1)
 
     def at(self, step: int) -> list[Demonstrations]:
         """Training demonstrations of the files of a training step."""
-        count = len(self._shards.paths)
-        if count <= TOGETHER:
-            wanted, later = [*range(count)], []
+        if len(self._used) <= TOGETHER:
+            wanted, later = self._used, []
         else:
             place = step // STEPS
             *wanted, last = (self._file(place + offset) for offset in range(TOGETHER + 1))
@@ -131,9 +131,9 @@ class Stream:
 
     def _file(self, place: int) -> int:
         """Number of the file at a place of the endless order, in which all files come before one comes again."""
-        count = len(self._shards.paths)
+        count = len(self._used)
         order = torch.randperm(count, generator=generator("cpu", self._seed, place // count, ORDER))
-        return int(order[place % count])
+        return self._used[int(order[place % count])]
 
     def _opened(self, number: int) -> Demonstrations:
         found, excluded = self._read(self._shards.paths[number]), self._excluded.get(number, frozenset())

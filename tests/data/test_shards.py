@@ -65,6 +65,20 @@ def test_a_step_has_the_same_windows_in_another_run(folder: Path) -> None:
     assert len(files) <= shards.TOGETHER
 
 
+def test_a_file_of_held_out_demonstrations_is_never_read(tmp_path: Path) -> None:
+    folder = tmp_path / "single"
+    folder.mkdir()
+    for number in range(12):
+        states = np.full((1, TIME, 2), 100.0 * number) + np.arange(TIME)[None, :, None] * 0.01
+        np.savez(folder / f"{number:02d}.npz", states=states, concepts=("left", "right")[number % 2])
+    data, found = batches(folder, 200)
+    source = data.domain.source(None)
+    assert isinstance(source, FileSource)
+    held = {round(value / 100) for value in source.split("validation", 0, 0).states[:, 0, 0].tolist()}
+    assert len(held) == 2
+    assert {round(value / 100) for states in found for value in states[:, 0, 0].tolist()} <= {*range(12)} - held
+
+
 def test_few_files_are_all_in_memory(tmp_path: Path) -> None:
     data, found = batches(write(tmp_path / "few", 3), 30)
     assert {round(value / 100) for states in found[:5] for value in states[:, 0, 0].tolist()} == {0, 1, 2}
@@ -89,7 +103,7 @@ def test_the_sample_has_the_longest_and_each_concept(tmp_path: Path, monkeypatch
         ("left", "right", "rare"), True
     )
     assert int(found.sample.lengths.max()) == 30
-    assert len(found.sample) == len(found.origins) < found.demonstrations == 123
+    assert len(found.sample) == len(found.origins) < sum(found.sizes) == 123
     for (number, row), states in zip(found.origins, found.sample.states, strict=True):
         if number < 3:
             assert round(float(states[0, 0])) == 100 * number + row
