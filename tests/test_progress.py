@@ -2,6 +2,7 @@
 
 import io
 import sys
+import time
 
 import pytest
 
@@ -14,6 +15,20 @@ class Terminal(io.StringIO):
 
     def isatty(self) -> bool:
         return True
+
+
+def test_work_that_reports_nothing_shows_its_seconds_in_a_terminal(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(progress, "WAIT", 0.01)
+    with progress.waiting("loading"):
+        time.sleep(0.1)
+    assert capsys.readouterr() == ("", "")
+    monkeypatch.setattr(sys, "stderr", terminal := Terminal())
+    with progress.waiting("loading"):
+        time.sleep(0.1)
+    assert terminal.getvalue().startswith("\rloading, 0 s")
+    assert terminal.getvalue().endswith("\r\x1b[K")
 
 
 def test_without_a_terminal_there_is_a_line_at_the_start_each_tenth_and_the_end(

@@ -16,6 +16,7 @@ from ftl_lightning.cli import concepts, demonstrations, experiments, pages
 from ftl_lightning.services import trust
 from ftl_lightning.services.command_line import TRAINER, Arguments, check_inputs, command_checks, one_line
 from ftl_lightning.services.errors import LONGEST, Note, UserError, mistake_of_machine, require, short
+from ftl_lightning.services.progress import waiting
 from ftl_lightning.services.text import any_terminal, line, say
 from ftl_lightning.version import __version__
 
@@ -196,7 +197,8 @@ def _dispatch(verb: str, arguments: Arguments) -> None:
         _INVERT.run(verb, arguments)
     elif verb in TRAINER_VERBS:
         check_inputs(verb, arguments, TRAINER)
-        from ftl_lightning.apps.lightning_cli import run
+        with waiting("loading"):
+            from ftl_lightning.apps.lightning_cli import run
 
         run(verb, arguments)
     else:

@@ -1,6 +1,7 @@
 """Progress of long work on standard error: a moving bar in a terminal, a few plain lines elsewhere."""
 
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,6 +15,34 @@ if TYPE_CHECKING:
 
 LINES = 10
 """Number of lines of a bar without a terminal."""
+
+
+WAIT = 1.0
+"""Seconds between two signs of :func:`waiting`."""
+
+
+@contextmanager
+def waiting(title: str) -> Iterator[None]:
+    """Show in a terminal that work goes on which reports nothing, such as imports, by its seconds; the line disappears."""
+    if not sys.stderr.isatty():
+        yield
+        return
+    ended, begin = threading.Event(), time.monotonic()
+
+    def show() -> None:
+        while not ended.wait(WAIT):
+            sys.stderr.write(f"\r{title}, {time.monotonic() - begin:.0f} s")
+            sys.stderr.flush()
+
+    shown = threading.Thread(target=show, daemon=True)
+    shown.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        shown.join()
+        sys.stderr.write("\r\x1b[K")
+        sys.stderr.flush()
 
 
 class Advance(Protocol):
