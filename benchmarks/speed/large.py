@@ -85,10 +85,10 @@ def main() -> None:
             data.mkdir()
             size = write(data, 10**decade)
             command = [sys.executable, __file__, "--steps", str(chosen.steps), "--fit", str(data), f"{place}/model"]
-            told = subprocess.run(command, check=True, stdout=subprocess.PIPE, env=os.environ | {"OMP_NUM_THREADS": "1"}).stdout
+            output = subprocess.run(command, check=True, stdout=subprocess.PIPE, env=os.environ | {"OMP_NUM_THREADS": "1"}).stdout
             files = len([*data.glob("*.npz")])
-        found = json.loads(told.decode().splitlines()[-1])
-        numbers = {name: round(value, 4 if name == "step" else 1) for name, value in found.items()}
+        measured = json.loads(output.decode().splitlines()[-1])
+        numbers = {name: round(value, 4 if name == "step" else 1) for name, value in measured.items()}
         rows.append({"recorded steps": 10**decade, "files": files, "megabytes": round(size / 1e6, 1), **numbers})
         print(rows[-1], flush=True)
     write_text(chosen.out, json.dumps({"training steps": chosen.steps, "rows": rows}, indent=1) + "\n")

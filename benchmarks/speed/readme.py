@@ -45,7 +45,7 @@ def run(arguments: Sequence[str]) -> dict[str, float]:
     child, terminal = pty.fork()
     if not child:
         os.execvpe(arguments[0], [*arguments], os.environ | {"OMP_NUM_THREADS": "1", "TERM": "xterm"})
-    last, silence, told = begin, 0.0, b""
+    last, silence, output = begin, 0.0, b""
     while True:
         ready, _, _ = select.select([terminal], [], [], 1.0)
         if not ready:
@@ -58,11 +58,11 @@ def run(arguments: Sequence[str]) -> dict[str, float]:
         silence, last = max(silence, now - last), now
         if not read:
             break
-        told = (told + read)[-2000:]
+        output = (output + read)[-2000:]
     _, status = os.waitpid(child, 0)
     os.close(terminal)
     if status:
-        raise SystemExit(f"{shlex.join(arguments)[:200]}\n{told.decode(errors='replace')}")
+        raise SystemExit(f"{shlex.join(arguments)[:200]}\n{output.decode(errors='replace')}")
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     processor = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     return {"seconds": round(last - begin, 1), "processor": round(processor, 1), "silence": round(silence, 1)}
@@ -73,15 +73,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("results/readme.json"))
     chosen = parser.parse_args()
-    found, here = dict[str, dict[str, float]](), Path.cwd()
+    measured, here = dict[str, dict[str, float]](), Path.cwd()
     with tempfile.TemporaryDirectory() as folder:
         for title, arguments in programs(README.read_text(encoding="utf-8")):
             os.chdir(here if "report" in arguments else folder)  # which reads results/
-            found[title] = run(arguments)
+            measured[title] = run(arguments)
             os.chdir(here)
-            print(title, found[title], flush=True)
-    write_text(chosen.out, json.dumps(found, indent=1) + "\n")
-    rows = [f"| {title} | {row['seconds']} s | {row['processor']} s | {row['silence']} s |" for title, row in found.items()]
+            print(title, measured[title], flush=True)
+    write_text(chosen.out, json.dumps(measured, indent=1) + "\n")
+    rows = [f"| {title} | {row['seconds']} s | {row['processor']} s | {row['silence']} s |" for title, row in measured.items()]
     write_text(
         TABLE, "\n".join(["| in README | seconds | of the processor | longest silence |", "|---|---|---|---|", *rows]) + "\n"
     )

@@ -54,14 +54,14 @@ class Shards:
         parts, origins, counts, sizes, longest = list[Demonstrations](), list[tuple[int, int]](), dict[str, int](), list[int](), 0
         with bar(f"reading {len(paths)} files of {folder}", len(paths)) as advance:
             for number, path in enumerate(paths):
-                found = read(path)
+                demonstrations = read(path)
                 if parts:
-                    _check_alike(path, found, paths[0], parts[0])
-                rows = _spread(found, SAMPLE // len(paths), counts, longest)
-                longest = max(longest, int(found.lengths.max()))
-                parts.append(found.rows(rows))
+                    _check_alike(path, demonstrations, paths[0], parts[0])
+                rows = _spread(demonstrations, SAMPLE // len(paths), counts, longest)
+                longest = max(longest, int(demonstrations.lengths.max()))
+                parts.append(demonstrations.rows(rows))
                 origins += [(number, row) for row in rows]
-                sizes.append(len(found))
+                sizes.append(len(demonstrations))
                 advance()
         return cls(tuple(paths), concatenate(parts), tuple(origins), tuple(sizes))
 
@@ -71,13 +71,13 @@ class Shards:
         return f"{sum(self.sizes):,} demonstrations in {len(self.paths):,} files"
 
 
-def _check_alike(path: str, found: Demonstrations, first: str, known: Demonstrations) -> None:
+def _check_alike(path: str, demonstrations: Demonstrations, first: str, known: Demonstrations) -> None:
     for key, some, other in (
-        ("state_names", found.state_names, known.state_names),
-        ("state_units", found.state_units, known.state_units),
-        ("state_kinds", found.state_kinds, known.state_kinds),
-        ("per_step", found.per_step, known.per_step),
-        ("observed", _words(found), _words(known)),
+        ("state_names", demonstrations.state_names, known.state_names),
+        ("state_units", demonstrations.state_units, known.state_units),
+        ("state_kinds", demonstrations.state_kinds, known.state_kinds),
+        ("per_step", demonstrations.per_step, known.per_step),
+        ("observed", _words(demonstrations), _words(known)),
     ):
         if some != other:
             raise UserError(f"{path}: key {key!r}: expected those of {first}, {list(other)}, found {list(some)}")
@@ -87,13 +87,13 @@ def _words(demonstrations: Demonstrations) -> tuple[str, ...]:
     return tuple(f"{name}: {feature.words}" for name, feature in sorted(demonstrations.features.items()))
 
 
-def _spread(found: Demonstrations, size: int, counts: dict[str, int], longest: int) -> list[int]:
+def _spread(demonstrations: Demonstrations, size: int, counts: dict[str, int], longest: int) -> list[int]:
     """Evenly spaced rows of about ``size`` bytes, one longer than ``longest``, and the first of rare concepts."""
-    width = found.states.shape[2] * found.states.element_size()
-    wanted = min(len(found), max(1, round(size / (float(found.lengths.double().mean()) * width))))
-    rows = set(torch.linspace(0, len(found) - 1, wanted).round().long().tolist())
-    rows |= {int(found.lengths.argmax())} if int(found.lengths.max()) > longest else set()
-    for row, text in enumerate(found.concepts):
+    width = demonstrations.states.shape[2] * demonstrations.states.element_size()
+    wanted = min(len(demonstrations), max(1, round(size / (float(demonstrations.lengths.double().mean()) * width))))
+    rows = set(torch.linspace(0, len(demonstrations) - 1, wanted).round().long().tolist())
+    rows |= {int(demonstrations.lengths.argmax())} if int(demonstrations.lengths.max()) > longest else set()
+    for row, text in enumerate(demonstrations.concepts):
         if row in rows or counts.get(text, 0) < FEWEST:
             rows.add(row)
             counts[text] = counts.get(text, 0) + 1
@@ -136,5 +136,7 @@ class Stream:
         return self._used[int(order[place % count])]
 
     def _opened(self, number: int) -> Demonstrations:
-        found, excluded = self._read(self._shards.paths[number]), self._excluded.get(number, frozenset())
-        return found.rows([row for row in range(len(found)) if row not in excluded]) if excluded else found
+        demonstrations, excluded = self._read(self._shards.paths[number]), self._excluded.get(number, frozenset())
+        return (
+            demonstrations.rows([row for row in range(len(demonstrations)) if row not in excluded]) if excluded else demonstrations
+        )

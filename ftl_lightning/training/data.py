@@ -343,7 +343,7 @@ class OwnData(PretrainingData):
         with about(path):
             fitted = self.domain.fitted(read_own(path))
         for text in set(fitted.concepts) - set(self._number):
-            raise UserError(f"{path}: expected the texts that the file had before, found {text!r}, too; did the file change?")
+            raise UserError(f"{path}: expected the concepts that the file had at the start, found also {text!r}")
         return fitted
 
     @single_precision()
@@ -356,11 +356,11 @@ class OwnData(PretrainingData):
         with rows_of(*((0, 1) if self.trainer is None else (self.trainer.global_rank, self.trainer.world_size))):
             rows = drawn(self.batch_size, lambda n: torch.randint(int(ends[-1]), (n,), generator=draw))
             share = _even(rows, draw)
-        own = torch.bucketize(rows, ends, right=True)
+        part_of = torch.bucketize(rows, ends, right=True)
         batches = [
-            self._windows(part, rows[own == number] - int(ends[number]) + len(part), share[own == number])
+            self._windows(part, rows[part_of == number] - int(ends[number]) + len(part), share[part_of == number])
             for number, part in enumerate(parts)
-            if (own == number).any()
+            if (part_of == number).any()
         ]
         states, concepts = torch.cat([batch.states for batch in batches]), torch.cat([batch.concepts for batch in batches])
         return Batch(

@@ -121,7 +121,7 @@ def test_a_folder_that_does_not_fit_is_refused_by_its_file(tmp_path: Path, folde
 def test_a_file_that_changes_is_told(folder: Path) -> None:
     data, _ = batches(folder, 1)
     np.savez(folder / "5.npz", states=np.zeros((4, TIME, 2)), concepts="up")
-    with pytest.raises(UserError, match=r"5\.npz: expected the texts that the file had before, found 'up'"):
+    with pytest.raises(UserError, match=r"5\.npz: expected the concepts that the file had at the start, found also 'up'"):
         data._opened(str(folder / "5.npz"))
 
 
