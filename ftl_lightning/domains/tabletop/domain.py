@@ -38,15 +38,15 @@ def source(root: Path | None, wide: bool = False) -> "Expert":
     check_simulator()
     from ftl_lightning.domains.tabletop.source import Expert
 
-    return Expert(WIDE_CONCEPTS, WIDE_NAME, begun_anew=WIDE_CONCEPTS) if wide else Expert()
+    return Expert(WIDE_CONCEPTS, WIDE_NAME, begun_anew=WIDE_CONCEPTS, coupled=True) if wide else Expert()
 
 
-def environment(ends_at: Collection[str] = (TRIANGLE,)) -> "TableTopEnvironment":
-    """Environment in which an episode ends when the circle touches any of ``ends_at``; a ``UserError`` without the simulator."""
+def environment(ends_at: Collection[str] = (TRIANGLE,), coupled: bool = False) -> "TableTopEnvironment":
+    """See :class:`.TableTopEnvironment`; a ``UserError`` without the simulator."""
     check_simulator()
     from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
 
-    return TableTopEnvironment(ends_at=ends_at)
+    return TableTopEnvironment(ends_at=ends_at, coupled=coupled)
 
 
 def judge(goal: str, rollout: Rollout) -> dict[str, Tensor]:
@@ -67,10 +67,11 @@ def act(plans: Tensor, step: int, observed: Observed) -> Tensor:
 Make = Callable[[str, InitialStates, Demonstrations | None, int], Policy | None]
 
 
-def _replayed(tasks: tuple[str, ...], height: float | None = None, feedback: bool = True) -> Make:
+def _replayed(tasks: tuple[str, ...], height: float | None = None, feedback: bool = True, coupled: bool = False) -> Make:
     """Policy for ``tasks`` that replays actions of an expert, recorded in a separate simulation; bitwise equal to the expert.
 
-    See :func:`ftl_lightning.domains.tabletop.experts.moves` for ``height`` and ``feedback``.
+    See :func:`ftl_lightning.domains.tabletop.experts.moves` for ``height`` and ``feedback``, :class:`.TableTopEnvironment` for
+    ``coupled``.
     """
 
     def make(goal: str, starts: InitialStates, demonstrations: Demonstrations | None, seed: int) -> Policy | None:
@@ -81,7 +82,7 @@ def _replayed(tasks: tuple[str, ...], height: float | None = None, feedback: boo
         from ftl_lightning.domains.tabletop.source import perform
 
         actions: list[Tensor] = []
-        env = TableTopEnvironment()
+        env = TableTopEnvironment(coupled=coupled)
         try:
             for row, scene in enumerate(starts.require_scenes().numpy()):
                 try:
@@ -93,7 +94,7 @@ def _replayed(tasks: tuple[str, ...], height: float | None = None, feedback: boo
                     _LOG.warning("table-top %r, episode %d: %r; the reference policy has no action there", goal, row, error)
                     actions.append(torch.full((1, interface.ACTION), torch.nan))
                     env.close()
-                    env = TableTopEnvironment()
+                    env = TableTopEnvironment(coupled=coupled)
         finally:
             env.close()
         return lambda observed, rows, step: torch.stack([actions[row][min(step, len(actions[row]) - 1)] for row in rows])
@@ -101,11 +102,15 @@ def _replayed(tasks: tuple[str, ...], height: float | None = None, feedback: boo
     return make
 
 
-POLICIES = {
-    "expert (oracle)": _replayed(interface.TASKS),
-    "table-height push": _replayed((PUSH_ON_BOOK,), height=PUSH_HEIGHT),
-    "straight push": _replayed((PUSH, PUSH_ON_BOOK), feedback=False),
-}
+def _policies(coupled: bool) -> dict[str, Make]:
+    return {
+        "expert (oracle)": _replayed(interface.TASKS, coupled=coupled),
+        "table-height push": _replayed((PUSH_ON_BOOK,), height=PUSH_HEIGHT, coupled=coupled),
+        "straight push": _replayed((PUSH, PUSH_ON_BOOK), feedback=False, coupled=coupled),
+    }
+
+
+POLICIES = _policies(coupled=False)
 """``table-height push`` pushes on the book at table height; ``straight push`` has no feedback."""
 
 _ON_ROBOT = ("new concept", 0.55, ""), ("training representation", 0.15, ""), ("training concept", 0.90, PUSH)
@@ -144,7 +149,7 @@ WIDE = replace(
     name=WIDE_NAME,
     concepts=Concepts(WIDE_CONCEPTS, interface.WIDE_SUITES, table=_FOLDER / "wide_embeddings.safetensors"),
     source=partial(source, wide=True),
-    closed_loop=replace(_LOOP, environment=partial(environment, ends_at=OBJECTS)),
+    closed_loop=replace(_LOOP, environment=partial(environment, ends_at=OBJECTS, coupled=True), policies=_policies(coupled=True)),
     comparison=replace(DOMAIN.comparison, paper=None),
 )
-"""Table-top with more pushes and picks than the paper."""
+"""Table-top with more pushes and picks than the paper, and a gripper with coupled fingers."""

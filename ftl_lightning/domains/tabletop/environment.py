@@ -77,6 +77,7 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
     Args:
         arm_drawn: whether images show the arm, which hides much of the table from above.
         ends_at: objects whose contact with the circle ends an episode.
+        coupled: whether both fingers of the gripper always have the same opening, as on the real arm.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": HERTZ}  # noqa: RUF012 (gymnasium's)
@@ -86,8 +87,8 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
     observation_space: gymnasium.spaces.Space[Any] = gymnasium.spaces.Dict({IMAGE: _image, POSE: _pose})
     action_space = gymnasium.spaces.Box(*np.array([*REACH, (0.0, OPEN)], dtype=np.float32).T)
 
-    def __init__(self, arm_drawn: bool = False, ends_at: Collection[str] = (TRIANGLE,)) -> None:
-        self.arm_drawn, self.ends_at = arm_drawn, frozenset(ends_at)
+    def __init__(self, arm_drawn: bool = False, ends_at: Collection[str] = (TRIANGLE,), coupled: bool = False) -> None:
+        self.arm_drawn, self.ends_at, self.coupled = arm_drawn, frozenset(ends_at), coupled
         self.client = self._connected()
         self.scene = np.zeros(SCENE, dtype=np.float32)
         self.bodies = Bodies(-1, {})
@@ -117,7 +118,7 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
             self.client.disconnect()
             self.client, self._built = self._connected(), 0
         self._built += 1
-        self.bodies = build(self.client, self.scene, self.arm_drawn)
+        self.bodies = build(self.client, self.scene, self.arm_drawn, self.coupled)
         self._place(self.scene[HAND][:3].astype(np.float64), OPEN)
         return self.begun(), self._info()
 

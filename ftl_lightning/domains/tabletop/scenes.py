@@ -306,14 +306,20 @@ def scenes(task: str, count: int, seed: int) -> Tensor:
 
 SURFACES = (BOOK, WHITE)  # Objects that can carry the triangle
 RAISED = 0.5  # Probability of a triangle on a surface, if one is visible
+CLOSE = 0.05  # Maximum distance in metres, in x and y, of an object from the lifted circle that covers it
 
 HIDDEN: Pose = (-5.0, 0.0, 0.0)  # Position of objects that an image does not show
 
 
-def free_pose(rng: np.random.Generator, name: str, taken: Mapping[str, Points]) -> tuple[float, Pose]:
-    """Draw height and pose of a distractor without overlap; :data:`HIDDEN` if none fits. The triangle may lie on a surface."""
+def free_pose(
+    rng: np.random.Generator, name: str, taken: Mapping[str, Points], near: NDArray[np.float64] | None = None
+) -> tuple[float, Pose]:
+    """Draw height and pose of a distractor without overlap; :data:`HIDDEN` if none fits. The triangle may lie on a surface.
+
+    ``near (2,)``, in metres: the pose is drawn on the table around it, up to :data:`CLOSE` in x and in y.
+    """
     below = [surface for surface in SURFACES if surface in taken] if name == TRIANGLE else []
-    if below and rng.uniform() < RAISED:
+    if below and near is None and rng.uniform() < RAISED:
         under = below[rng.integers(len(below))]
         low, high = taken[under].min(axis=0), taken[under].max(axis=0)
         for _ in range(TRIES):
@@ -324,7 +330,8 @@ def free_pose(rng: np.random.Generator, name: str, taken: Mapping[str, Points]) 
                 return HEIGHT[under], pose
     low, high = np.transpose(SIGHT)
     for _ in range(TRIES):
-        pose = (*anywhere(rng), random_yaw(rng, name))
+        x, y = anywhere(rng) if near is None else map(float, near + rng.uniform(-CLOSE, CLOSE, 2))
+        pose = (x, y, random_yaw(rng, name))
         points = outline(name, *pose)
         if (points > low).all() and (points < high).all() and _apart(points, taken):
             return 0.0, pose

@@ -20,7 +20,18 @@ from ftl_lightning.domains.tabletop import scenes as layouts
 from ftl_lightning.domains.tabletop.environment import TableTopEnvironment, judged
 from ftl_lightning.domains.tabletop.experts import PAST, SLIP, SLIPS, STAY, TREMBLE, led_astray, moves, style
 from ftl_lightning.domains.tabletop.interface import FEATURES, IMAGE, NAME, OVERHEAD, PLACES, POSE, PUSH, PUSHES, Camera
-from ftl_lightning.domains.tabletop.scenes import HEIGHT, HIDDEN, NEEDED, PRESENT, SURFACES, draw_scene, free_pose, outline, scenes
+from ftl_lightning.domains.tabletop.scenes import (
+    CIRCLE,
+    HEIGHT,
+    HIDDEN,
+    NEEDED,
+    PRESENT,
+    SURFACES,
+    draw_scene,
+    free_pose,
+    outline,
+    scenes,
+)
 from ftl_lightning.domains.tabletop.world import turned
 from ftl_lightning.services.errors import require
 from ftl_lightning.services.randomness import VALIDATION_SEED, task_key
@@ -30,6 +41,7 @@ _LOG = logging.getLogger(__name__)
 MOST = 4  # Maximum attempts per demonstration
 VERSION = 5  # Version of the experts; part of the cache key
 TIMES = {PUSH: 4}  # Factors of the demonstrations per training concept: the paper has 124 of the push, 29 to 31 of others
+COVERED = 0.3  # Probability that a distractor lies under a lifted circle, if the circle is higher than the distractor
 RECOVERY_SEED = 2_000_000  # Seed offset of recovery demonstrations
 _NO_SETTINGS = ("ROUND", "FEATURES", "NEEDED", "TYPE_CHECKING")  # Constants without influence on a demonstration
 _SETTINGS = {
@@ -63,8 +75,8 @@ def scattered(
     """Images ``(time, 3, 64, 64)`` of a finished episode, and positions ``(time, 5, 4)``, see :meth:`.TableTopEnvironment.seen`.
 
     Networks memorise few demonstrations by their distractors. Random distractors carry no information (domain randomisation, Tobin
-    et al., 2017). The triangle also lies on book and block, where it looks larger. ``trace`` is that of the episode's last info;
-    the objects of ``env`` are moved.
+    et al., 2017). The triangle also lies on book and block, where it looks larger. With coupled fingers, objects also lie under a
+    lifted circle, which covers them in the image. ``trace`` is that of the episode's last info; the objects of ``env`` are moved.
     """
     needed = NEEDED[task](np.random.default_rng(0))
     objects = env.bodies.objects
@@ -73,10 +85,16 @@ def scattered(
     for moment in trace:
         env.show(moment)
         taken = {name: env.outline(name) for name in objects if name in needed}
+        circle = env.places()[CIRCLE]
+        below = circle[2] - HEIGHT[CIRCLE] / 2
         for name in others:
             base, (x, y, yaw) = 0.0, HIDDEN
             if rng.uniform() < PRESENT:
-                base, (x, y, yaw) = free_pose(rng, name, taken)
+                if env.coupled and below > HEIGHT[name] and rng.uniform() < COVERED:
+                    free = {key: shape for key, shape in taken.items() if key != CIRCLE}
+                    base, (x, y, yaw) = free_pose(rng, name, free, near=circle[:2])
+                else:
+                    base, (x, y, yaw) = free_pose(rng, name, taken)
             env.client.resetBasePositionAndOrientation(objects[name], (x, y, base + HEIGHT[name] / 2), turned(yaw))
             if x != HIDDEN[0]:
                 taken[name] = outline(name, x, y, yaw)
@@ -139,9 +157,10 @@ def _stayed(values: list[Any]) -> NDArray[Any]:
     return np.stack([*values, *[values[-1]] * STAY])
 
 
-Job = tuple[str, int, int, bool, bool]
-"""Task, seed, episode number, whether distractors are scattered in each image, and whether the episode is a recovery."""
-_ENVIRONMENT: list[TableTopEnvironment] = []  # Environment of this process
+Job = tuple[str, int, int, bool, bool, bool]
+"""Task, seed, episode number, whether distractors are scattered in each image, whether the episode is a recovery, and whether the
+fingers are coupled."""
+_ENVIRONMENT: dict[bool, TableTopEnvironment] = {}  # Environments of this process, with and without coupled fingers
 
 
 def _scene(job: Job) -> np.ndarray:
@@ -151,17 +170,17 @@ def _scene(job: Job) -> np.ndarray:
 
 def _episode(job: Job) -> Episode | None:
     """Run an episode of the expert; ``None`` if the simulator raised an error, except for a lack of resources."""
-    task, seed, number, scatter, elsewhere = job
-    if not _ENVIRONMENT:
-        _ENVIRONMENT.append(TableTopEnvironment())
+    task, seed, number, scatter, elsewhere, coupled = job
+    if coupled not in _ENVIRONMENT:
+        _ENVIRONMENT[coupled] = TableTopEnvironment(coupled=coupled)
     try:
         rng = np.random.default_rng([seed, task_key(task), number, 1])
-        return perform(_ENVIRONMENT[0], task, _scene(job), rng, scatter=scatter, begin=led_astray if elsewhere else None)
+        return perform(_ENVIRONMENT[coupled], task, _scene(job), rng, scatter=scatter, begin=led_astray if elsewhere else None)
     except (MemoryError, OSError):
         raise
     except Exception as error:  # any error of the simulator: other episodes continue
         _LOG.warning("table-top %r, episode %d: %r; it counts as rejected", task, number, error)
-        _ENVIRONMENT.pop().close()
+        _ENVIRONMENT.pop(coupled).close()
         return None
 
 
@@ -174,7 +193,14 @@ def _episodes(jobs: list[Job], workers: int) -> Iterator[Episode | None]:
 
 
 def demonstrations(
-    task: str, count: int, seed: int, workers: int, progress: Callable[[], None], scatter: bool = False, elsewhere: bool = False
+    task: str,
+    count: int,
+    seed: int,
+    workers: int,
+    progress: Callable[[], None],
+    scatter: bool = False,
+    elsewhere: bool = False,
+    coupled: bool = False,
 ) -> Demonstrations:
     """The first ``count`` successful episodes of a task by number, independent of ``workers``; a ``UserError`` if there are fewer.
 
@@ -182,9 +208,10 @@ def demonstrations(
         progress: called after each successful episode.
         scatter: whether to scatter distractors in each image, with object positions as a privileged feature.
         elsewhere: whether episodes are recoveries, with the hand anywhere around the circle.
+        coupled: see :class:`.TableTopEnvironment`.
     """
     kept: list[tuple[Job, Episode]] = []
-    jobs = [(task, seed, number, scatter, elsewhere) for number in range(MOST * count)]
+    jobs = [(task, seed, number, scatter, elsewhere, coupled) for number in range(MOST * count)]
     tried = 0
     for job, episode in zip(jobs, _episodes(jobs, workers), strict=False):
         tried += 1
@@ -229,9 +256,13 @@ class Expert:
     """Successful episodes of the scripted experts, cached; tasks ``begun_anew``, by default pushes, also have recoveries."""
 
     def __init__(
-        self, concepts: Sequence[str] = interface.TRAINING_CONCEPTS, domain: str = NAME, begun_anew: Sequence[str] | None = None
+        self,
+        concepts: Sequence[str] = interface.TRAINING_CONCEPTS,
+        domain: str = NAME,
+        begun_anew: Sequence[str] | None = None,
+        coupled: bool = False,
     ) -> None:
-        self.concepts, self.domain = tuple(concepts), domain
+        self.concepts, self.domain, self.coupled = tuple(concepts), domain, coupled
         self.begun_anew = tuple(task for task in self.concepts if task in (PUSHES if begun_anew is None else begun_anew))
 
     def split(self, name: Split, count: int, seed: int) -> Demonstrations:
@@ -249,8 +280,9 @@ class Expert:
     ) -> Demonstrations:
         """``count`` demonstrations of a task, see :func:`demonstrations`."""
         settings = {"domain": NAME, "task": interface.check_task(task), "count": count, "seed": seed, "experts": VERSION}
-        settings |= {**_SETTINGS, "scatter": scatter, "elsewhere": elsewhere}
-        made = cached(settings, count, lambda progress: demonstrations(task, count, seed, workers, progress, scatter, elsewhere))
+        settings |= {**_SETTINGS, "scatter": scatter, "elsewhere": elsewhere, "coupled": self.coupled}
+        how = scatter, elsewhere, self.coupled
+        made = cached(settings, count, lambda progress: demonstrations(task, count, seed, workers, progress, *how))
         return made if made.domain == self.domain else replace(made, domain=self.domain)
 
     def starts(self, task: str, count: int, seed: int) -> InitialStates:

@@ -29,6 +29,8 @@ FASTEST = 0.02  # Maximum hand movement in metres per step of an episode; longer
 MASS = {CIRCLE: 0.06, TRIANGLE: 0.15, BOOK: 0.35, WHITE: 0.0, BOWL: 0.0}  # Masses in kg; objects of zero mass are fixed
 FRICTION = {CIRCLE: 0.5, TRIANGLE: 0.6, BOOK: 0.5, WHITE: 0.6, BOWL: 0.6}
 TABLE_FRICTION, FINGER_FRICTION = 0.5, 0.9
+COUPLING = 50.0
+"""Maximum force in newtons of the gear between the fingers. Without it, a held object drifts by up to 14 mm to either side."""
 COLOUR = {
     CIRCLE: (0.10, 0.60, 0.20),
     TRIANGLE: (0.95, 0.50, 0.05),
@@ -55,8 +57,13 @@ class Bodies:
     objects: dict[str, int]
 
 
-def build(client: Simulator, scene: NDArray[np.float32], arm_drawn: bool) -> Bodies:
-    """Build a valid scene after a full reset of the simulator; without the arm, images take a twentieth of the time."""
+def build(client: Simulator, scene: NDArray[np.float32], arm_drawn: bool, coupled: bool) -> Bodies:
+    """Build a valid scene after a full reset of the simulator.
+
+    Args:
+        arm_drawn: whether images show the arm; without it, images take a twentieth of the time.
+        coupled: whether the fingers are coupled, see :data:`COUPLING`.
+    """
     import pybullet_data
 
     client.resetSimulation()
@@ -71,8 +78,18 @@ def build(client: Simulator, scene: NDArray[np.float32], arm_drawn: bool) -> Bod
         client.changeVisualShape(robot, link, rgbaColor=[1, 1, 1, 0])
     for finger in FINGERS:
         client.changeDynamics(robot, finger, lateralFriction=FINGER_FRICTION)
+    if coupled:
+        _couple(client, robot)
     objects = {name: _object(client, scene, name, arm_drawn) for name in OBJECTS if scene[COLUMNS[name]][0] > 0.5}
     return Bodies(robot, objects)
+
+
+def _couple(client: Simulator, robot: int) -> None:
+    """Couple the fingers, as the gear of the real gripper does."""
+    gear = {"jointType": pybullet().JOINT_GEAR, "jointAxis": [1, 0, 0]}
+    frames = {"parentFramePosition": [0, 0, 0], "childFramePosition": [0, 0, 0]}
+    coupling = client.createConstraint(robot, FINGERS[0], robot, FINGERS[1], **gear, **frames)
+    client.changeConstraint(coupling, gearRatio=-1, erp=0.1, maxForce=COUPLING)
 
 
 def turned(yaw: float) -> tuple[float, float, float, float]:
