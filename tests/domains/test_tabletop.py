@@ -28,6 +28,7 @@ from ftl_lightning.domains.tabletop.interface import (
     PUSH_TO_BOWL,
     TASKS,
     TO_BOOK,
+    TO_TRIANGLE,
     TO_WHITE,
 )
 from ftl_lightning.domains.tabletop.scenes import BOOK, BOWL, CIRCLE, TRIANGLE, WHITE, gap, outline, scene_of, scenes, within
@@ -218,6 +219,28 @@ def test_experts_succeed(task: str, env: TableTopEnvironment) -> None:
     assert np.linalg.norm(np.diff(episode.commands[:, :3], axis=0), axis=-1).max() < 0.0201
     assert np.median(np.abs(episode.commands[:, :3] - episode.poses[:, :3])) < 0.005
     assert len(episode.images) == len(episode.commands)
+
+
+@pytest.mark.slow
+def test_coupled_fingers_hold_the_circle_in_place_and_objects_lie_under_it_in_pictures() -> None:
+    drift, under = {}, {}
+    for coupled in (False, True):
+        env = TableTopEnvironment(coupled=coupled)
+        scene = scenes(TO_TRIANGLE, 1, 77)[0].numpy()
+        held = source.perform(env, TO_TRIANGLE, scene, np.random.default_rng([5, 0]))
+        circle = np.stack(env._trace)[:, 9:12]
+        lifted = circle[:, 2] > 0.1
+        drift[coupled] = float(np.ptp((circle[:, :2] - held.poses[: len(circle), :2])[lifted], axis=0).max())
+        scattered = source.perform(
+            env, TO_BOOK, scene_of({**APART, BOOK: (0.58, -0.15, 0.0)}), np.random.default_rng(0), scatter=True
+        )
+        env.close()
+        assert scattered.places is not None
+        apart = np.linalg.norm(scattered.places[:, 1, 1:3] - scattered.places[:, 0, 1:3], axis=-1)
+        under[coupled] = bool(((apart < 0.03) & (scattered.places[:, 1, 0] > 0) & (scattered.places[:, 0, 3] > 0.1)).any())
+    assert drift[True] < 0.005
+    assert drift[False] > 0.015
+    assert under == {False: False, True: True}
 
 
 @pytest.mark.slow
