@@ -37,7 +37,15 @@ METHODS = (
 REFERENCES = ("expert (oracle)", "straight push", "table-height push")
 PUBLISHED = {PUSH_ON_BOOK: ".55", PUSH: ".90", FROM_PUSH: ".15"}
 """The paper's, on a real robot."""
-ENDS = ("success", "rim", "beside", "fell", "wrong object", "timeout")
+ENDS = {
+    "success": "success",
+    "rim": "edge of reach",
+    "beside": "hand beside circle",
+    "fell": "fell",
+    "wrong object": "wrong object",
+    "timeout": "timeout",
+}
+KINDS = {"read": "read by the encoder", "linear": "linear probe", "network": "network probe"}
 
 
 def number(value: float) -> str:
@@ -92,15 +100,15 @@ def failures(found: dict[str, Any]) -> str:
     for task, ways in found["tasks"].items():
         for way, one in ways.items():
             total, rates = sum(one["ends"].values()), pd.Series(one["success"], dtype=float)
-            lines.append([task, way, cell(rates), *(number(one["ends"].get(end, 0) / total) for end in ENDS[1:])])
-    return table(["task", "who acts", *ENDS], lines)
+            lines.append([task, way, cell(rates), *(number(one["ends"].get(end, 0) / total) for end in list(ENDS)[1:])])
+    return table(["task", "who acts", *ENDS.values()], lines)
 
 
 def eyes(found: dict[str, Any]) -> str:
     """Errors in cm, a line for each object and surface."""
-    kinds = [kind for kind in ("read", "linear", "network") if f"{kind} rms" in next(iter(found["cm"].values()))]
+    kinds = [kind for kind in KINDS if f"{kind} rms" in next(iter(found["cm"].values()))]
     lines = [[name, *(number(one[f"{kind} rms"]) for kind in kinds)] for name, one in found["cm"].items()]
-    return table(["where it is seen, error in cm (root mean square)", *kinds], lines)
+    return table(["localisation error, cm (root mean square)", *(KINDS[kind] for kind in kinds)], lines)
 
 
 def wide_tasks(rows: pd.DataFrame) -> str:

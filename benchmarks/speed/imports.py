@@ -130,7 +130,7 @@ def shown(verb: str, folder: Path, runs: int) -> float:
 
 def table(found: Mapping[str, Any]) -> str:
     """Markdown: the start of each verb, and what is not measured so."""
-    lines = ["| verb | start | of it imports | modules | largest packages | `--help` |", "|---|---|---|---|---|---|"]
+    lines = ["| command | start | imports | modules | largest packages | `--help` |", "|---|---|---|---|---|---|"]
     for verb, measured in found["start"].items():
         packages = ", ".join(
             f"{name} {seconds:.1f} s" for name, seconds in list(measured["largest"].items())[:SHOWN] if seconds >= LEAST

@@ -83,7 +83,7 @@ def main() -> None:
     write_text(chosen.out, json.dumps(measured, indent=1) + "\n")
     rows = [f"| {title} | {row['seconds']} s | {row['processor']} s | {row['silence']} s |" for title, row in measured.items()]
     write_text(
-        TABLE, "\n".join(["| in README | seconds | of the processor | longest silence |", "|---|---|---|---|", *rows]) + "\n"
+        TABLE, "\n".join(["| in README | seconds | processor seconds | longest silence |", "|---|---|---|---|", *rows]) + "\n"
     )
 
 

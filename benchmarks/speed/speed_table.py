@@ -70,7 +70,7 @@ def batching(found: Mapping[str, Any]) -> str:
     for number in numbers:
         rates = [{row["concepts"]: f"{row['concepts a second']:.2g}" for row in own["rows"]} for own in found.values()]
         lines.append(cells(number, *(rate.get(number, "") for rate in rates)))
-    lines.append(cells("most over one", *(f"{own['most over one']:.1f}" for own in found.values())))
+    lines.append(cells("best over first", *(f"{own['most over one']:.1f}" for own in found.values())))
     beside = "most over one concept in a process"
     lines.append(cells(f"{beside}, single precision", *(f"{own[beside]:.1f}" if beside in own else "" for own in found.values())))
     curves = [own.get("curve") for own in found.values()]
@@ -85,7 +85,7 @@ def batching(found: Mapping[str, Any]) -> str:
 def product_rate(found: Mapping[str, Any]) -> str:
     """The share of the rate of matrix products."""
     best = found["best"]
-    lines = head("what", "operations a second", "share of the best product's", "most of the time")
+    lines = head("what", "operations a second", "share of the best product's", "costliest operations")
     for name, rate in found["products, operations a second"].items():
         lines.append(cells(f"product {name}", f"{rate / 1e9:.0f} G", f"{100 * rate / best:.0f} %", ""))
     for name, own in found.items():

@@ -212,10 +212,10 @@ def short_overview(results: pd.DataFrame) -> Table:
     brackets = _brackets(results) if any("[" in line[1] + line[2] for line in lines) else ""
     caption = (
         f"New concepts, mean ± standard error over tasks{brackets}. {OURS}: the concept in the paper's form "
-        "unless another is named; networks, representations, most losses and some guidance weights are ours. "
-        "Lead: over the best or the named baseline, 95 % interval over tasks"
+        "unless another is named; networks, representations, most losses and some guidance weights are not the paper's. "
+        "Lead: over the best baseline, of the paper's form or the form named there, 95 % interval over tasks"
     )
-    head = ["domain: setting, metric", OURS, "best baseline", "best without pretraining; oracle", "lead"]
+    head = ["domain: setting, metric", OURS, "best pretrained baseline", "best without pretraining; oracle", "lead"]
     return make_table(None, "overview", caption, lines, head)
 
 
@@ -283,7 +283,7 @@ def _overview(results: pd.DataFrame, lines: Sequence[tuple[Domain, str, str]], c
     head = ["domain: setting, metric", "lead", *grouped]
     legend = (
         f". {PAPERS_METHOD.name}: the paper's form unless another is named; "
-        "networks, representations, most losses and some guidance weights are ours"
+        "networks, representations, most losses and some guidance weights are not the paper's"
     )
     caption = (
         f"Ours and the baselines, mean ± standard error over tasks{_brackets(results)}; lead: by how much ours is better than the "
