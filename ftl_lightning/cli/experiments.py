@@ -310,6 +310,10 @@ def report(
         from ftl_lightning.apps.paper import items, measure_again, printed
 
         chosen, folder = items("" if paper == "all" else paper), Path(results)
+        if not folder.is_dir():
+            raise UserError(
+                f"{folder}: expected a folder of results, found nothing; run this in a checkout, or add --results FOLDER"
+            )
         if run:
             measure_again(chosen, folder, folder := Path(out) / "measured again", root)
         say("\n\n".join(printed(item, folder) for item in chosen))

@@ -22,6 +22,15 @@ def test_items_are_named_by_words_and_numbers() -> None:
         items("Table 99")
 
 
+def test_no_folder_of_results_is_one_clear_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["report", "--paper=Table 4", "--results=none"]) == 2
+    assert (
+        capsys.readouterr()
+        .err.strip()
+        .endswith("none: expected a folder of results, found nothing; run this in a checkout, or add --results FOLDER")
+    )
+
+
 def test_an_item_is_printed_with_the_papers_numbers_and_without_links(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["report", "--paper=Table 1", f"--results={RESULTS}"]) == 0
     out = capsys.readouterr().out
