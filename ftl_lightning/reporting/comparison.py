@@ -213,7 +213,7 @@ def short_overview(results: pd.DataFrame) -> Table:
     caption = (
         f"New concepts, mean ± standard error over tasks{brackets}. {OURS}: the concept in the paper's form "
         "unless another is named; networks, representations, most losses and some guidance weights are not the paper's. "
-        "Lead: over the best baseline, of the paper's form or the form named there, 95 % interval over tasks"
+        "Lead: of the paper's form, or one named there, over the best pretrained baseline; 95 % interval over tasks"
     )
     head = ["domain: setting, metric", OURS, "best pretrained baseline", "best without pretraining; oracle", "lead"]
     return make_table(None, "overview", caption, lines, head)
