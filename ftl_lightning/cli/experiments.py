@@ -305,6 +305,9 @@ def report(
         paper: table, figure or claim of the paper to print instead, such as "Table 4"; "all" for all.
         run: with ``paper``, measure its numbers again, into a subfolder of ``out``.
         root: with ``run``, the folder of recordings, for human motion.
+
+    Raises:
+        UserError: for ``paper`` without a folder of results.
     """
     if paper:
         from ftl_lightning.apps.paper import items, measure_again, printed
