@@ -103,6 +103,7 @@ def _replayed(tasks: tuple[str, ...], height: float | None = None, feedback: boo
 
 
 def _policies(coupled: bool) -> dict[str, Make]:
+    """``table-height push`` pushes on the book at table height; ``straight push`` has no feedback."""
     return {
         "expert (oracle)": _replayed(interface.TASKS, coupled=coupled),
         "table-height push": _replayed((PUSH_ON_BOOK,), height=PUSH_HEIGHT, coupled=coupled),
@@ -111,7 +112,6 @@ def _policies(coupled: bool) -> dict[str, Make]:
 
 
 POLICIES = _policies(coupled=False)
-"""``table-height push`` pushes on the book at table height; ``straight push`` has no feedback."""
 
 _ON_ROBOT = ("new concept", 0.55, ""), ("training representation", 0.15, ""), ("training concept", 0.90, PUSH)
 PUBLISHED = tuple(Published(setting, value, task=task, metric=EXECUTED) for setting, value, task in _ON_ROBOT)
