@@ -55,6 +55,11 @@ class Rater:
             self.one("body").send_keys(key)
             assert self.answered == before + 1
 
+    def reload(self) -> tuple[str, int]:
+        """Load the page again: its question, and the number of answers."""
+        self.page.driver.refresh()
+        return self.question, self.answered
+
     def come_back(self, study: Made) -> None:
         """On another day, in another window."""
         old = self.page.driver.current_window_handle
@@ -91,8 +96,7 @@ def test_somebody_rates_everything_with_a_break_and_the_report_takes_the_file(
     assert len(page.js(SHADES)) > 20
     assert page.js("document.documentElement.scrollWidth <= window.innerWidth")
     asked = rater.question
-    page.driver.refresh()
-    assert (rater.question, rater.answered) == (asked, 7)
+    page.until(lambda: rater.reload() == (asked, 7), 10)  # a browser stores answers shortly after a script has set them
     rater.answer(5)
     asked = rater.question
     assert page.driver.get_log("browser") == []
