@@ -24,7 +24,9 @@ al., 2023)."""
 STRIDES = (2, 4)
 RESNET18 = "resnet18"
 NETWORKS = ("small", RESNET18)
-KEYPOINTS, POINTS, GRID = HEADS = ("keypoints", "points", "grid")
+KEYPOINTS, POINTS, OBJECTS, GRID = HEADS = ("keypoints", "points", "objects", "grid")
+OF_OBJECTS = POINTS, OBJECTS  # Heads with a supervised point for each object
+HIDDEN = 64  # Width of the readout of objects
 POINT = 4
 """Values per point: x, y, height, and the visibility logit."""
 
@@ -46,6 +48,13 @@ class ResidualBlock(nn.Module):
         return out
 
 
+def _grid(x: Tensor) -> Tensor:
+    """Column and row (-1 to 1) of each pixel of maps ``(batch, channels, height, width)``: ``(height * width, 2)``."""
+    height, width = x.shape[2:]
+    rows, columns = (torch.linspace(-1, 1, side, device=x.device) for side in (height, width))
+    return torch.stack((columns.repeat(height), rows.repeat_interleave(width)), dim=-1)
+
+
 class SpatialSoftmax(nn.Module):
     """Spatial softmax: position and value of the maximum of each channel (Levine et al., 2016)."""
 
@@ -55,13 +64,40 @@ class SpatialSoftmax(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """``(batch, channels, height, width)`` to column, row (-1 to 1) and height of each keypoint ``(batch, 3 * keypoints)``."""
-        height, width = x.shape[2:]
-        rows, columns = (torch.linspace(-1, 1, side, device=x.device) for side in (height, width))
-        grid = torch.stack((columns.repeat(height), rows.repeat_interleave(width)), dim=-1)
         maps = self.maps(x).flatten(2)
         share = maps.softmax(dim=-1)
-        column, row = (share @ grid).unbind(dim=-1)  # a single product: sums over large maps dominate the time
+        column, row = (share @ _grid(x)).unbind(dim=-1)  # a single product: sums over large maps dominate the time
         return torch.cat((column, row, (share * maps).sum(dim=-1).tanh()), dim=-1)
+
+
+class ObjectAttention(nn.Module):
+    """A point for each object, from the features where the object is.
+
+    Each object has ``maps`` spatial softmaxes. The first locates it; the mean features under all of them determine its height,
+    visibility and a correction of its position, which perspective scales with the height. A linear readout of the keypoints of all
+    objects instead confuses an object's height with the presence of others.
+
+    Args:
+        channels: channels of the feature map.
+        objects: number of objects.
+        maps: number of maps of each object.
+    """
+
+    def __init__(self, channels: int, objects: int, maps: int) -> None:
+        super().__init__()
+        self.objects, self.maps = objects, nn.Conv2d(channels, objects * maps, 1)
+        self.place = nn.Linear(2, 2, bias=False)
+        self.first, self.second = nn.Linear(maps * (2 + channels), HIDDEN), nn.Linear(HIDDEN, POINT + 1)
+        self.own = nn.Parameter(torch.zeros(objects, HIDDEN))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """``(batch, channels, height, width)`` to all x, y, heights and visibility logits ``(batch, 4 * objects)``."""
+        share = self.maps(x).flatten(2).softmax(dim=-1)
+        values = torch.cat((_grid(x).expand(len(x), -1, -1), x.flatten(2).transpose(1, 2)), dim=-1)
+        read = (share @ values).unflatten(1, (self.objects, -1))
+        scale, correction, rest = self.second(functional.relu(self.first(read.flatten(2)) + self.own)).split((1, 2, 2), dim=-1)
+        place = self.place(read[:, :, 0, :2]) * (1 + scale) + correction
+        return torch.cat((place, rest), dim=-1).transpose(1, 2).flatten(1)
 
 
 def _small(channels: int, widths: Sequence[int], stride: int, height: int, width: int) -> tuple[nn.Module, tuple[int, int, int]]:
@@ -105,10 +141,11 @@ class ImageEncoder(nn.Module):
         network: ``'small'``, or ``'resnet18'`` (11 million weights).
         widths: channels of the small network's first convolution and of its residual blocks, multiples of 8.
         stride: stride of the small network's first convolution and so of its feature map, 2 or 4; 2 localises more precisely.
-        head: ``'keypoints'`` (spatial softmax), ``'points'`` (object positions, supervised in pretraining) or ``'grid'`` (the whole
-            last feature map, for the small map of ResNet-18).
-        keypoints: number of keypoints, or of channels of the grid.
-        points: number of objects, for ``'points'``.
+        head: ``'keypoints'`` (spatial softmax), ``'objects'`` (object positions by attention, supervised in pretraining),
+            ``'points'`` (the same by a linear readout of keypoints) or ``'grid'`` (the whole last feature map, for the small map
+            of ResNet-18).
+        keypoints: number of keypoints, of channels of the grid, or of maps of each object.
+        points: number of objects, for ``'objects'`` and ``'points'``.
         crop: pixels removed from each side length: random crop in training, centre crop otherwise; 0 for none.
         origin: observed vector with the origin of keypoints (column and row in the image, -1 to 1) or points (x and y), such as
             the position of a hand. Empty for the image centre.
@@ -140,8 +177,8 @@ class ImageEncoder(nn.Module):
         channels, height, width = shape
         check_range(f"{key}.keypoints", keypoints, 1)
         check_range(f"{key}.crop", crop, 0, min(height, width) - 1)
-        count = "1 or more" if head == POINTS else "0"
-        require((points > 0) == (head == POINTS), f"{key}.points", f"{count} for {head}", points)
+        count = "1 or more" if head in OF_OBJECTS else "0"
+        require((points > 0) == (head in OF_OBJECTS), f"{key}.points", f"{count} for {head}", points)
         check_range(f"{key}.points", points, 0, MOST_POINTS)
         require(not origin or head != GRID, f"{key}.origin", "none for a head without keypoints", shown(origin))
         self.crop, self.origin = crop, origin
@@ -154,9 +191,11 @@ class ImageEncoder(nn.Module):
             require(min(height, width) >= 2 * stride, f"{key}.crop", least, f"{height} x {width}")
             self.network, maps = _small(channels, widths, stride, height, width)
         self.head: nn.Module
-        self.values = POINT if head == POINTS else 3  # per keypoint or point
+        self.values = POINT if head in OF_OBJECTS else 3  # per keypoint or point
         if head == GRID:
             self.head, self.size = nn.Sequential(nn.Conv2d(maps[0], keypoints, 1), nn.Flatten()), keypoints * maps[1] * maps[2]
+        elif head == OBJECTS:
+            self.head, self.size = ObjectAttention(maps[0], points, keypoints), POINT * points
         elif head == POINTS:
             self.size = POINT * points
             parts = OrderedDict(keypoints=SpatialSoftmax(maps[0], keypoints), read=nn.Linear(3 * keypoints, self.size))

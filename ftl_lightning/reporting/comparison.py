@@ -203,7 +203,8 @@ def short_overview(results: pd.DataFrame) -> Table:
         lines.append(
             [
                 _subject(domain, setting, metric),
-                ", ".join(f"{form.replace(f' {CHOSEN}', f' ({CHOSEN})')} {cell}".strip() for form, cell in ours) or MISSING,
+                ", ".join(f"{form.replace(f' {CHOSEN}', f' ({CHOSEN})')}: {cell}" if form else cell for form, cell in ours)
+                or MISSING,
                 MISSING if rival is None else f"{label(*rival)} {_cell(domain, rows, rival, setting, metric)}",
                 ", ".join(f"{name} {mean:.2f}" for name, mean in best) or MISSING,
                 MISSING if lead is None else prefix + (f"{lead.amount}, {lead.shown}" if lead.baseline == rival else str(lead)),
@@ -211,9 +212,9 @@ def short_overview(results: pd.DataFrame) -> Table:
         )
     brackets = _brackets(results) if any("[" in line[1] + line[2] for line in lines) else ""
     caption = (
-        f"New concepts, mean ± standard error over tasks{brackets}. {OURS}: the concept in the paper's form "
-        "unless another is named; networks, representations, most losses and some guidance weights are not the paper's. "
-        "Lead: of the paper's form, or one named there, over the best pretrained baseline; 95 % interval over tasks"
+        f"New concepts, mean ± standard error over tasks{brackets}. {OURS} (ours): in the paper's form "
+        "(parametrisation) unless another is named; networks, representations, most losses and some guidance weights are not the "
+        "paper's. Lead: the paper's form, or the named form, less the best pretrained baseline; 95 % interval over tasks"
     )
     head = ["domain: setting, metric", OURS, "best pretrained baseline", "best without pretraining; oracle", "lead"]
     return make_table(None, "overview", caption, lines, head)

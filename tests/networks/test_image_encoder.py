@@ -15,7 +15,7 @@ from ftl_lightning.igm.settings import BudgetOptions
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.methods.ftl_igm.pretraining import LossOptions, PretrainingModule
 from ftl_lightning.methods.pretraining import CloningPretraining, InContextPretraining
-from ftl_lightning.networks.image_encoder import ImageEncoder, ImageEncoders, SpatialSoftmax
+from ftl_lightning.networks.image_encoder import ImageEncoder, ImageEncoders, ObjectAttention, SpatialSoftmax
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.randomness import generator
 from ftl_lightning.training.adaptation import LearnerAdaptation
@@ -38,6 +38,7 @@ SIDE, TIME = 16, 6
         ({"crop": 4, "head": "grid", "keypoints": 1}, 7 * 5),
         ({"stride": 2, "head": "grid", "keypoints": 1}, 16 * 12),
         ({"head": "points", "points": 5, "keypoints": 2}, 20),
+        ({"head": "objects", "points": 5, "keypoints": 2}, 20),
     ],
 )
 def test_sizes(options: dict[str, Any], size: int) -> None:
@@ -57,9 +58,10 @@ def test_sizes(options: dict[str, Any], size: int) -> None:
     ("options", "message"),
     [
         ({"network": "vit"}, "model.image_encoder.network: expected one of small, resnet18, found 'vit'"),
-        ({"head": "mean"}, "model.image_encoder.head: expected one of keypoints, points, grid, found 'mean'"),
+        ({"head": "mean"}, "model.image_encoder.head: expected one of keypoints, points, objects, grid, found 'mean'"),
         ({"stride": 3}, "model.image_encoder.stride: expected one of 2, 4, found 3"),
         ({"head": "points"}, "model.image_encoder.points: expected 1 or more for points, found 0"),
+        ({"head": "objects"}, "model.image_encoder.points: expected 1 or more for objects, found 0"),
         ({"points": 2}, "model.image_encoder.points: expected 0 for keypoints, found 2"),
         ({"widths": [12]}, r"model.image_encoder.widths: expected multiples of 8, found \[12\]"),
         ({"widths": []}, r"model.image_encoder.widths: expected multiples of 8, found \[\]"),
@@ -90,6 +92,26 @@ def test_a_keypoint_is_where_its_map_is_largest() -> None:
     maps[0, 0, 0, 8] = maps[1, 0, 3, 2] = 1
     expected = torch.tensor([[1.0, -1.0], [-0.5, 0.5]])  # column, row
     torch.testing.assert_close(softmax(maps)[:, :2], expected, atol=1e-4, rtol=0)
+
+
+def test_attention_to_an_object_moves_with_it_and_ignores_others() -> None:
+    torch.manual_seed(0)
+    head = ObjectAttention(2, 2, 1)
+    nn.init.zeros_(head.maps.bias)
+    head.maps.weight.data[:, :, 0, 0] = 50 * torch.eye(2)  # object 0 is where channel 0 is active, object 1 where channel 1 is
+    nn.init.eye_(head.place.weight)
+    for module in (head.first, head.second):
+        nn.init.zeros_(module.weight)
+        nn.init.zeros_(module.bias)
+    maps = torch.zeros(2, 2, 5, 9)
+    maps[:, 0, 0, 8] = maps[0, 1, 2, 4] = maps[1, 1, 3, 2] = 1
+    found = head(maps).unflatten(1, (4, 2)).transpose(1, 2)  # (image, object, value)
+    expected = torch.tensor([[[1.0, -1.0], [0.0, 0.0]], [[1.0, -1.0], [-0.5, 0.5]]])
+    torch.testing.assert_close(found[..., :2], expected, atol=1e-4, rtol=0)
+    head.second.weight.data.normal_()
+    head.first.weight.data.normal_()
+    found = head(maps).unflatten(1, (4, 2)).transpose(1, 2)
+    torch.testing.assert_close(found[0, 0], found[1, 0])  # the other object has moved
 
 
 def test_keypoints_are_told_from_their_origin() -> None:

@@ -147,6 +147,7 @@ DOMAIN = Domain(
 WIDE = replace(
     DOMAIN,
     name=WIDE_NAME,
+    plans=replace(DOMAIN.plans, views=interface.WIDE_VIEWS),
     concepts=Concepts(WIDE_CONCEPTS, interface.WIDE_SUITES, table=_FOLDER / "wide_embeddings.safetensors"),
     source=partial(source, wide=True),
     closed_loop=replace(_LOOP, environment=partial(environment, ends_at=OBJECTS, coupled=True), policies=_policies(coupled=True)),

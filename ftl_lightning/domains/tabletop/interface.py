@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -204,20 +205,27 @@ def noisy_keypoints(places: Tensor, draw: torch.Generator) -> Tensor:
     return torch.cat((visible * (centres + noise) / HALF, SURE * (2 * visible - 1)), dim=-1).transpose(1, 2).flatten(1)
 
 
-def _turned(states: Tensor, observed: Observed, draw: torch.Generator | None) -> tuple[Tensor, Observed]:
-    """Mirror, rotate and shift scenes at random; new tasks (``draw`` is ``None``) are not transformed."""
+def _turned(states: Tensor, observed: Observed, draw: torch.Generator | None, unmoved: float = 0.0) -> tuple[Tensor, Observed]:
+    """Mirror, rotate and shift scenes at random, except a share that stays ``unmoved``.
+
+    New tasks (``draw`` is ``None``) are not transformed. Interpolation blurs images, so an encoder of moved images alone is less
+    precise on new images.
+    """
     if draw is None:
         return states, observed
     count, device = len(states), states.device
     uniform = drawn(count, lambda n: torch.rand((n, 5), generator=draw, device=device))
     most = torch.where(uniform[:, 1] < 0.5, TURN, math.pi)
-    angles, shifts = most * (2 * uniform[:, 2] - 1), SHIFT * (2 * uniform[:, 3:] - 1)
-    return moved(states, observed, uniform[:, 0] < 0.5, angles, shifts)
+    moves = uniform[:, 1] < 1 - unmoved
+    angles, shifts = moves * most * (2 * uniform[:, 2] - 1), moves[:, None] * SHIFT * (2 * uniform[:, 3:] - 1)
+    return moved(states, observed, moves & (uniform[:, 0] < 0.5), angles, shifts)
 
 
-def _turned_and_raised(states: Tensor, observed: Observed, draw: torch.Generator | None) -> tuple[Tensor, Observed]:
+def _turned_and_raised(
+    states: Tensor, observed: Observed, draw: torch.Generator | None, unmoved: float = 0.0
+) -> tuple[Tensor, Observed]:
     """:func:`_turned`; half of the scenes without image are also raised, by up to :data:`RAISED`."""
-    states, observed = _turned(states, observed, draw)
+    states, observed = _turned(states, observed, draw, unmoved)
     if draw is None or IMAGE in observed:
         return states, observed
     height = drawn(len(states), lambda n: torch.rand(n, generator=draw, device=states.device))
@@ -260,3 +268,6 @@ VIEWS = {
 """All views augment scenes. States are relative to the hand in ``hand`` and ``points``, absolute in ``moved``. ``points`` is for
 image encoders with x and y of objects; ``level`` is ``points`` without raised scenes, as in the paper.
 Keypoints can be relative to the hand, see :data:`ORIGIN`."""
+UNMOVED = 0.25
+WIDE_VIEWS = {POINTS: replace(VIEWS[POINTS], perturb=partial(_turned_and_raised, unmoved=UNMOVED))}
+"""View of the wide model: a share of :data:`UNMOVED` of the scenes is not moved."""

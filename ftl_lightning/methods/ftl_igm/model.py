@@ -16,6 +16,7 @@ from ftl_lightning.igm.forms.adapter import LowRank, adaptable
 from ftl_lightning.igm.model import DiffusionModel, Draws
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.igm.settings import Loss
+from ftl_lightning.networks.image_encoder import OF_OBJECTS
 from ftl_lightning.services.errors import require, short
 from ftl_lightning.services.spectrum import Spectrum, check_cosines
 from ftl_lightning.services.validation import check_range, from_mapping
@@ -57,7 +58,7 @@ def build_denoiser(config: DiffusionConfig) -> nn.Module:
     over_time = config.prediction == "cosines" and getattr(kind, "over_time", False)
     require(not over_time, "prediction", f"clean for {config.denoiser}, whose output is smooth by itself", "cosines")
     points = config.denoiser_args.get("initial_encoder") == "points" and config.image_dim
-    reads = config.image_encoder.get("head") == "points"
+    reads = config.image_encoder.get("head") in OF_OBJECTS
     require(reads or not points, "denoiser_args.initial_encoder", "flat", "points: image_encoder.head reads no points")
     denoiser = from_mapping(kind, config.denoiser_args, "denoiser_args", config)
     if config.prediction == "epsilon":
