@@ -6,7 +6,19 @@ import pytest
 import torch
 
 from ftl_lightning.data.features import take
-from ftl_lightning.domains.tabletop.interface import HAND, IMAGE, MOVED, ORIGIN, POSE, SHIFT, VIEWS, moved
+from ftl_lightning.domains.tabletop.interface import (
+    HAND,
+    IMAGE,
+    MOVED,
+    ORIGIN,
+    POINTS,
+    POSE,
+    SHIFT,
+    UNMOVED,
+    VIEWS,
+    WIDE_VIEWS,
+    moved,
+)
 from ftl_lightning.domains.tabletop.scenes import BOOK, CIRCLE, TRIANGLE, scene_of
 from ftl_lightning.domains.tabletop.source import initial_states
 from ftl_lightning.services.randomness import generator
@@ -66,3 +78,19 @@ def test_perturbing_is_random_as_drawn_and_leaves_a_new_task_alone() -> None:
     assert 0.8 * SHIFT < (once[0][..., :2] - plans[..., :2]).abs().max() <= SHIFT + 1e-6
     assert once[1][IMAGE].dtype == torch.uint8
     assert perturb(plans, many, None)[0] is plans
+
+
+def test_the_wide_model_sees_some_scenes_as_the_camera_does() -> None:
+    perturb = WIDE_VIEWS[POINTS].perturb
+    assert perturb is not None
+    many = take(initial_states(torch.from_numpy(scene_of(PLACED))[None]).observed, [0] * 200)
+    plans = torch.rand(1, 4, 4).repeat(200, 1, 1)
+    states, seen = perturb(plans, many, generator("cpu", 0))
+    still = (states == plans).flatten(1).all(dim=1)
+    assert abs(float(still.float().mean()) - UNMOVED) < 0.1
+    same = (seen[IMAGE] == many[IMAGE]).flatten(1).all(dim=1)
+    assert same[still].all()
+    assert not same[~still].any()
+    old = VIEWS[POINTS].perturb
+    assert old is not None
+    assert torch.equal(old(plans, many, generator("cpu", 0))[0][~still], states[~still])
