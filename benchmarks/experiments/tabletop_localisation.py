@@ -2,10 +2,12 @@
 
     python benchmarks/experiments/tabletop_localisation.py --pretrained pretrained/tabletop --out results/tabletop_localisation.json
 
+(``_wide`` after both names: of the wide model.)
+
 Linear regression (ridge) and a small network estimate the position of every object from the features of an image. They are trained
 on new scenes of all tasks and tested on others; the encoder stays fixed. Errors are distances in centimetres, for circle and
-triangle by the surface below them. `middle` is the error of the mean position. An encoder of points also has its direct estimate
-(`read`).
+triangle by the surface below them. `middle` is the error of the mean position. An encoder of objects also has its direct estimate
+(`read`), and an error of the height of a held circle (that of the hand), in demonstrations of a pick with and without the bowl.
 """
 
 import argparse
@@ -15,13 +17,14 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from ftl_lightning.domains.tabletop.interface import HALF, MIDDLE, TASKS
-from ftl_lightning.domains.tabletop.scenes import COLUMNS, scenes, support
+from ftl_lightning.domains.tabletop.interface import HALF, IMAGE, MIDDLE, POSE, TASKS, THRESHOLD, TO_WHITE
+from ftl_lightning.domains.tabletop.scenes import BOWL, COLUMNS, scenes, support
 from ftl_lightning.domains.tabletop.source import initial_states
 from ftl_lightning.networks.image_encoder import POINT
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.progress import bar
 from ftl_lightning.services.tensor_file import write_text
+from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.model_folder import load_model
 
 SEED = 990
@@ -29,6 +32,8 @@ TESTED = 0.2
 """Share of the scenes."""
 STEPS = 2000
 """Of the small network's training."""
+EPISODES, LIFTED = 20, 0.1
+"""Demonstrations with a held circle, and minimum height of the hand in metres."""
 
 
 def ridge(features: Tensor, places: Tensor) -> nn.Module:
@@ -66,6 +71,25 @@ def told(features: Tensor, name: str) -> Tensor | None:
         return None
     number = list(COLUMNS).index(name)
     return 100 * (features[:, [number, count + number]] * HALF + torch.tensor(MIDDLE))
+
+
+def heights(model: ConceptModel) -> dict[str, dict[str, float]]:
+    """Errors in centimetres of the height of a held circle, with and without the bowl; of an encoder of objects."""
+    episodes = model.domain.source(None).draw(TO_WHITE, EPISODES, SEED)
+    images, poses = episodes.observed[IMAGE], episodes.observed[POSE]
+    within = torch.arange(images.shape[1]) < episodes.lengths[:, None]
+    held = within & (episodes.states[..., 3] < THRESHOLD) & (poses[..., 2] > LIFTED)
+    assert episodes.scenes is not None
+    assert model.images is not None
+    bowl = (episodes.scenes[:, COLUMNS[BOWL].start] > 0.5)[:, None].expand_as(held)[held]
+    with torch.no_grad():
+        read = torch.cat([model.images({IMAGE: some}) for some in images[held].split(256)])
+    off = 100 * (read[:, 2 * len(COLUMNS)] * HALF - poses[..., 2][held])
+    parts = {"with the bowl": off[bowl], "without the bowl": off[~bowl]}
+    return {
+        f"height of a held circle {name}": {"images": float(len(part)), "read rms": part.square().mean().sqrt().item()}
+        for name, part in parts.items()
+    }
 
 
 def main() -> None:
@@ -114,6 +138,8 @@ def main() -> None:
                 numbers |= {f"{kind} median": one.median().item(), f"{kind} rms": one.square().mean().sqrt().item()}
             found[name + where] = numbers
             print(name + where, {key: round(value, 2) for key, value in numbers.items()}, flush=True)
+    if features.shape[1] == POINT * len(COLUMNS):
+        found |= heights(model)
     if options.out:
         content = {"model": model.hash, "pretrained": Path(options.pretrained).name, "cm": found}
         write_text(options.out, json.dumps(content, indent=2) + "\n")

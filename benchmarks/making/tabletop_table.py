@@ -107,7 +107,9 @@ def failures(found: dict[str, Any]) -> str:
 def eyes(found: dict[str, Any]) -> str:
     """Errors in cm, a line for each object and surface."""
     kinds = [kind for kind in KINDS if f"{kind} rms" in next(iter(found["cm"].values()))]
-    lines = [[name, *(number(one[f"{kind} rms"]) for kind in kinds)] for name, one in found["cm"].items()]
+    lines = []
+    for name, one in found["cm"].items():
+        lines.append([name, *(number(one[f"{kind} rms"]) if f"{kind} rms" in one else "-" for kind in kinds)])
     return table(["localisation error, cm (root mean square)", *(KINDS[kind] for kind in kinds)], lines)
 
 
@@ -175,12 +177,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     rows = rows_of(chosen.results / "tabletop.csv")
     found = {
         name: json.loads((chosen.results / f"tabletop_{name}.json").read_text(encoding="utf-8"))
-        for name in ("failures", "localisation", "targets")
+        for name in ("failures", "localisation", "localisation_wide", "targets")
     }
     parts = [new_task(rows), training_tasks(rows), failures(found["failures"]), eyes(found["localisation"])]
     write_text(chosen.out / "tabletop.md", "\n\n".join(parts) + "\n")
     rows = rows_of(chosen.results / "tabletop_wide.csv")
-    parts = [wide_tasks(rows), eight_tasks(rows), targets(found["targets"]), wide_training(rows)]
+    parts = [wide_tasks(rows), eight_tasks(rows), targets(found["targets"]), wide_training(rows), eyes(found["localisation_wide"])]
     write_text(chosen.out / "tabletop_wide.md", "\n\n".join(parts) + "\n")
 
 

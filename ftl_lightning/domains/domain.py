@@ -50,6 +50,7 @@ class View:
         perturb: augmentation in training, ``(states, observed, generator) -> (states, observed)`` with a slightly different present
             state, from which a model learns to recover. Without a generator, it only hides what new tasks do not show. ``None`` for
             none.
+        pretraining: another augmentation in pretraining; ``None`` for ``perturb`` there too.
         act: planner for plans in this view, as ``act`` of :class:`~ftl_lightning.domains.execution.ClosedLoop`; ``None`` for the
             domain's planner.
         scales: groups of columns of a state; columns at the same position in each group share a scale.
@@ -64,6 +65,7 @@ class View:
     encode: Callable[[Tensor, Observed], Tensor]
     decode: Callable[[Tensor, Observed], Tensor]
     perturb: Callable[[Tensor, Observed, torch.Generator | None], tuple[Tensor, Observed]] | None = None
+    pretraining: Callable[[Tensor, Observed, torch.Generator | None], tuple[Tensor, Observed]] | None = None
     act: Callable[[Tensor, int, Observed], Tensor] | None = None
     scales: tuple[tuple[int, ...], ...] = ()
     same_columns: bool = False

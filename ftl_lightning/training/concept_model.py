@@ -350,9 +350,14 @@ class ConceptModel(Shown, nn.Module, ABC):
         """Refuse an adapter that does not fit; ``UserError`` naming the weight; always for a method without adapters."""
         raise UserError(f"key 'adapter': expected none for a model of {self.method.name}, found one")
 
-    def perturbed(self, states: Tensor, observed: Observed, draw: torch.Generator) -> tuple[Tensor, Observed]:
-        """Training windows with the present state perturbed, if configured."""
-        return (states, observed) if self._perturb is None else self._perturb(states, observed, draw)
+    def perturbed(
+        self, states: Tensor, observed: Observed, draw: torch.Generator, pretraining: bool = False
+    ) -> tuple[Tensor, Observed]:
+        """Training windows with the present state perturbed, if configured; in ``pretraining`` or in inversion."""
+        if self._perturb is None or self.view is None:
+            return states, observed
+        augment = self.view.pretraining if pretraining and self.view.pretraining is not None else self._perturb
+        return augment(states, observed, draw)
 
     def encode(self, states: Tensor, observed: Observed, frames: Tensor | None = None) -> Tensor:
         """Map behaviour ``(sample, horizon, state)`` in the domain's units to the network's inputs.

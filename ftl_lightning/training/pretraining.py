@@ -154,7 +154,7 @@ class Pretraining(pl.LightningModule, ABC, Generic[M]):
         """Losses ``(batch,)`` of a perturbed batch; ``model`` is in training mode while fitting."""
 
     def _perturbed_losses(self, model: M, batch: Batch, draw: torch.Generator) -> tuple[Tensor, Batch]:
-        states, observed = model.perturbed(batch.states, batch.observed, draw)
+        states, observed = model.perturbed(batch.states, batch.observed, draw, pretraining=True)
         perturbed = batch._replace(states=states, observed=dict(observed))
         return self.losses(model, perturbed, draw), perturbed
 
@@ -285,7 +285,7 @@ class Pretraining(pl.LightningModule, ABC, Generic[M]):
         with_images, without_images = self.teaching.split(self.domain, batch)
         losses, perturbed = self._perturbed_losses(self.raw, with_images, draw)
         if without_images is not None:
-            states, observed = self.raw.perturbed(without_images.states, without_images.observed, draw)
+            states, observed = self.raw.perturbed(without_images.states, without_images.observed, draw, pretraining=True)
             privileged = without_images._replace(states=states, observed=self.teaching.simulated(self.domain, observed, draw))
             losses = torch.cat((losses, self.losses(self.raw, privileged, draw)))
         require(losses.dim() == 1, f"{class_path(type(self))}.losses", "losses (batch,)", tuple(losses.shape))

@@ -80,9 +80,10 @@ def test_perturbing_is_random_as_drawn_and_leaves_a_new_task_alone() -> None:
     assert perturb(plans, many, None)[0] is plans
 
 
-def test_the_wide_model_sees_some_scenes_as_the_camera_does() -> None:
-    perturb = WIDE_VIEWS[POINTS].perturb
+def test_pretraining_of_the_wide_model_leaves_some_scenes_as_the_camera_sees_them_but_inversion_none() -> None:
+    perturb, learning = WIDE_VIEWS[POINTS].pretraining, WIDE_VIEWS[POINTS].perturb
     assert perturb is not None
+    assert learning is not None
     many = take(initial_states(torch.from_numpy(scene_of(PLACED))[None]).observed, [0] * 200)
     plans = torch.rand(1, 4, 4).repeat(200, 1, 1)
     states, seen = perturb(plans, many, generator("cpu", 0))
@@ -91,6 +92,6 @@ def test_the_wide_model_sees_some_scenes_as_the_camera_does() -> None:
     same = (seen[IMAGE] == many[IMAGE]).flatten(1).all(dim=1)
     assert same[still].all()
     assert not same[~still].any()
-    old = VIEWS[POINTS].perturb
-    assert old is not None
-    assert torch.equal(old(plans, many, generator("cpu", 0))[0][~still], states[~still])
+    every = learning(plans, many, generator("cpu", 0))[0]
+    assert torch.equal(every[~still], states[~still])
+    assert not (every == plans).flatten(1).all(dim=1).any()

@@ -269,5 +269,6 @@ VIEWS = {
 image encoders with x and y of objects; ``level`` is ``points`` without raised scenes, as in the paper.
 Keypoints can be relative to the hand, see :data:`ORIGIN`."""
 UNMOVED = 0.25
-WIDE_VIEWS = {POINTS: replace(VIEWS[POINTS], perturb=partial(_turned_and_raised, unmoved=UNMOVED))}
-"""View of the wide model: a share of :data:`UNMOVED` of the scenes is not moved."""
+WIDE_VIEWS = {POINTS: replace(VIEWS[POINTS], pretraining=partial(_turned_and_raised, unmoved=UNMOVED))}
+"""View of the wide model: pretraining does not move a share of :data:`UNMOVED` of the scenes. Inversion moves all scenes: unmoved
+scenes of a few demonstrations would be memorised."""
