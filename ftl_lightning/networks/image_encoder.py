@@ -75,7 +75,7 @@ class ObjectAttention(nn.Module):
 
     Each object has ``maps`` spatial softmaxes. The first locates it; the mean features under all of them determine its height,
     visibility and a correction of its position, which perspective scales with the height. A linear readout of the keypoints of all
-    objects instead confuses an object's height with the presence of others.
+    objects can confuse an object's height with the presence of others.
 
     Args:
         channels: channels of the feature map.

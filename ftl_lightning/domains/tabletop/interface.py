@@ -268,7 +268,7 @@ VIEWS = {
 """All views augment scenes. States are relative to the hand in ``hand`` and ``points``, absolute in ``moved``. ``points`` is for
 image encoders with x and y of objects; ``level`` is ``points`` without raised scenes, as in the paper.
 Keypoints can be relative to the hand, see :data:`ORIGIN`."""
-UNMOVED = 0.25
+UNMOVED = 0.25  # Share of the scenes of pretraining
 WIDE_VIEWS = {POINTS: replace(VIEWS[POINTS], pretraining=partial(_turned_and_raised, unmoved=UNMOVED))}
 """View of the wide model: pretraining does not move a share of :data:`UNMOVED` of the scenes. Inversion moves all scenes: unmoved
 scenes of a few demonstrations would be memorised."""
