@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.services.errors import UserError, require, short
+from ftl_lightning.services.shipped import TOPICS
 from ftl_lightning.services.trust import OPTION, entry_points, is_vouched
 
 GROUP = "ftl_lightning.domains"
@@ -26,11 +27,12 @@ def _offered() -> dict[str, str]:
 
 @functools.cache
 def load_domain(name: str) -> Domain:
-    """Import a domain by entry-point name or ``package.module:DOMAIN``; for names in files see :func:`domain_of_file`.
+    """Import a domain by entry-point name, topic or ``package.module:DOMAIN``; for names in files see :func:`domain_of_file`.
 
     Raises:
         UserError: if there is no such domain, or the object is not a domain.
     """
+    name = TOPICS.get(name, name)
     reference = _offered().get(name, name)
     module, colon, attribute = reference.partition(":")
     if not colon:

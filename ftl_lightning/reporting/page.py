@@ -150,7 +150,8 @@ def _map(results: Path, domain: Domain) -> Iterator[dict[str, Any]]:
         return
     try:
         model = load_model(folder)
-        learned = [concept for concept in map(Concept.load, files) if concept.origin.pretrained == model.hash]
+        pretrained = model.hash
+        learned = [concept for concept in map(Concept.load, files) if concept.origin.pretrained == pretrained]
         places = concept_places(model, learned)
     except UserError as error:  # scikit-learn or the domain's package is missing
         say(f"concepts of {domain.name} are left out: {error}", error=True)

@@ -96,6 +96,7 @@ class Workspace:
     def __init__(self, model: str, root: Path | None = None) -> None:
         self.name = model
         self._model = FewShot.from_pretrained(model)
+        self._hash = self._model.model.hash  # of all weights: too slow to compute for each concept
         self._domain = self._model.domain
         self._demonstrating = Demonstrating(self._model, self._domain.source(root))
         self._count = 0
@@ -115,7 +116,7 @@ class Workspace:
         domain, recorder = self._domain, self._domain.recordings.recorder
         return {
             "title": title_of(self.name),
-            "model": {"name": self.name, "title": domain.name.replace("_", " "), "hash": self._model.model.hash},
+            "model": {"name": self.name, "title": domain.name.replace("_", " "), "hash": self._hash},
             "recorder": recorder and {"kind": recorder.kind, "hint": recorder.hint, "tasks": list(recorder.tasks)},
             "library": self._demonstrating.library,
             "uploads": list(self._demonstrating.files),
@@ -181,7 +182,7 @@ class Workspace:
         return known, known.learned, known.demonstrations
 
     def _content(self, key: str) -> Json:
-        return {"id": key, **self._concepts[key].content, "hash": self._model.model.hash}
+        return {"id": key, **self._concepts[key].content, "hash": self._hash}
 
     def _listed(self) -> list[Json]:
         return [self._content(key) for key in self._concepts]

@@ -46,6 +46,10 @@ FOLDS, CLEAR, FEWER = 5, 0.4, 2
 """Maximum number of leave-one-out folds; relative loss of one set below which it suffices, so that folds only decide about
 composition; number of folds then. Losses are relative to the unconditional loss.
 """
+NEARLY, WARM_STEPS = 0.2, 40
+"""Relative loss of one set below which it explains nearly everything: no folds are learned, and an adapter starts from a free
+set, with this maximum number of steps. Chosen on navigation's validation suite.
+"""
 TOLERANCE = 0.01
 """Default tolerance of early stopping."""
 OWN, BOTH, ALL = 0.8, 2.03, 3.27
@@ -159,11 +163,20 @@ def _adapted(
     mixed: bool,
     tell: Tell,
     by_sample: bool = False,
+    first: Concepts | None = None,
 ) -> dict[str, Concept]:
-    """Concepts of one set and an adapter; with ``mixed``, of mixtures that share an adapter (several demonstrations only)."""
+    """Concepts of one set and an adapter; with ``mixed``, of mixtures that share an adapter (several demonstrations only).
+
+    With ``first``, learning starts from these sets and takes at most :data:`WARM_STEPS`.
+    """
     one = _with_adapter(settings, mixed)
     most = min(steps, SKILLED_STEPS) if by_sample else _adapter_steps(settings, steps)
     start = Inversion(model, demonstrations, one, by_sample).to(model.device)
+    if first is not None:
+        most = min(most, WARM_STEPS)
+        with torch.no_grad():
+            start.embeddings.copy_(torch.stack([first[name].embeddings for name in start.concepts]))
+            start.weights.copy_(torch.stack([first[name].weights for name in start.concepts]) / _scale(settings))
     concepts = invert(model, demonstrations, one, most, tell, start=start)
     for name, concept in concepts.items():
         if concept.modes:
@@ -318,10 +331,8 @@ def _loss_shares(
     """Training and leave-one-out losses of one set for every concept."""
     every = {name: [row for row, text in enumerate(demonstrations.concepts) if text == name] for name in first}
     losses = {name: [_own_loss(model, _of(demonstrations, [name]), first[name], settings)] for name in first}
-    left = {
-        name: rows[:: -(-len(rows) // (FEWER if losses[name][0] < CLEAR else FOLDS))] if len(rows) > 2 else []
-        for name, rows in every.items()
-    }
+    most = {name: 0 if own < NEARLY else FEWER if own < CLEAR else FOLDS for name, (own,) in losses.items()}
+    left = {name: rows[:: -(-len(rows) // most[name])] if most[name] and len(rows) > 2 else [] for name, rows in every.items()}
     folds = [[row for row in every[name] if row != out] for name, rows in left.items() for out in rows]
     for off_span in (settings.embeddings.off_span, 0.0)[: 1 + model.text_space] if folds else ():
         learned = learned_from(model, demonstrations, folds, quickly(settings).changed(off_span=off_span), steps, tell)
@@ -337,9 +348,13 @@ def _loss_shares(
 
 def _own_loss(model: Invertible, demonstrations: Demonstrations, concept: Concept, settings: InversionSettings) -> float:
     """Relative training loss of one set of embeddings."""
-    weights = concept.weights if settings.omega != "learned" else concept.weights / settings.weights.scale
-    alone = Composition(concept.embeddings[None], weights[None]).to(model.device)
+    alone = Composition(concept.embeddings[None], concept.weights[None] / _scale(settings)).to(model.device)
     return float(relative_losses(model, demonstrations, alone, settings).mean())
+
+
+def _scale(settings: InversionSettings) -> float:
+    """Factor of a concept's guidance weights after learning."""
+    return settings.weights.scale if settings.omega == "learned" else 1.0
 
 
 def _of(demonstrations: Demonstrations, concepts: Collection[str]) -> Demonstrations:
@@ -365,9 +380,12 @@ def _chosen(
     if rest := {name: concept for name, concept in several.items() if not shares[name].suffices}:
         for name, concept in _with_modes(model, _of(demonstrations, rest), settings, steps, rest, tell).items():
             forms[name][MODES] = concept
-    if enough := [name for name in several if name not in rest]:
-        for name, concept in _adapted(model, _of(demonstrations, enough), settings, steps, False, tell).items():
-            forms[name][ADAPTED] = concept
+    enough = [name for name in several if name not in rest]
+    warm = [name for name in enough if shares[name].own < NEARLY and settings.embeddings.off_span == 1]
+    for names, start in ((warm, several), ([name for name in enough if name not in warm], None)):
+        if names:
+            for name, concept in _adapted(model, _of(demonstrations, names), settings, steps, False, tell, first=start).items():
+                forms[name][ADAPTED] = concept
     qualities = {name: measured(model, demonstrated[name], forms[name], settings.seed) for name in several}
     if narrow := [name for name in enough if qualities[name][ADAPTED].spread < NARROW]:
         for name, concept in _adapted(model, _of(demonstrations, narrow), settings, steps, True, tell).items():

@@ -23,6 +23,7 @@ from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.igm.settings import PAPER
 from ftl_lightning.services.errors import UserError
+from ftl_lightning.training.concept_model import ConceptModel
 from tests.conftest import ROOT
 
 TASK = "square diagonal to triangle"
@@ -260,6 +261,11 @@ def test_learning_stops_when_nobody_waits(opened: Workspace) -> None:
 
 
 @pytest.mark.slow
+def test_the_list_of_concepts_does_not_hash_the_weights(opened: Workspace, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(ConceptModel, "hash")
+    assert all(concept["hash"] for concept in opened.state()["concepts"])
+
+
 def test_an_older_concept_of_the_same_kind_is_no_rival() -> None:
     strokes = Workspace("strokes")
     for name in ("first heart", "second heart"):
