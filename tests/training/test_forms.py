@@ -13,6 +13,7 @@ from ftl_lightning.domains.object_rearrangement.scenes import columns, random_sc
 from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import Concept
+from ftl_lightning.igm.forms import choice
 from ftl_lightning.igm.forms.choice import ALL, OWN, RANK, TOLERANCE, _Shares, first_settings, learn
 from ftl_lightning.igm.forms.modes import Modes, even_stretch
 from ftl_lightning.igm.forms.quality import Quality
@@ -125,6 +126,15 @@ def test_a_single_demonstration_has_one_set_and_two_have_no_left_out_ones(model:
     assert one.choice.form == ONE
     two = model.learn(scenes(model, count=2), steps=10).concept
     assert "loss, left out" not in two.choice.numbers
+
+
+def test_an_adapter_starts_from_a_set_that_explains_nearly_everything(model: FewShot, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in {"NEARLY": 1e9, "OWN": 1e9, "WARM_STEPS": 0, "NARROW": 0.0}.items():
+        monkeypatch.setattr(choice, name, value)
+    learned = {form: model.learn(scenes(model), steps=20, form=form).concept for form in (AUTO, ONE)}
+    assert learned[AUTO].choice.form == ADAPTED
+    assert "loss, left out" not in learned[AUTO].choice.numbers
+    assert torch.equal(learned[AUTO].embeddings, learned[ONE].embeddings)
 
 
 @pytest.mark.slow
