@@ -336,6 +336,16 @@ def test_the_version_of_a_checkpoint(capsys: Told) -> None:
     ("arguments", "expected"),
     [
         ([*FIT, "--trainer.max_steps=many"], "key 'trainer.max_steps': expected int, found many"),
+        (["fit", "--trainer.max_steps=1"], "config: expected --config FILE"),
+        ([*FIT, "--trainer.max_step=1"], "unrecognized arguments: --trainer.max_step=1"),
+        (["concepts", "object_rearrangement", "--fold=x"], "unrecognized arguments: --fold=x"),
+        (["generate", "tabletop", "--out=z.mat"], "z.mat: expected the name of an .npz or .safetensors file"),
+        ([*SCENES, RIGHT, "--out=z.mat"], "z.mat: expected the name of an .npz or .safetensors file"),
+        (
+            [*SCENES, RIGHT, f"--initial={ROOT / 'README.md'}"],
+            "initial: expected no file, as models of object_rearrangement observe no",
+        ),
+        (["invert", "five.npz"], "expected a model, then a file of demonstrations"),
         ([*FIT, "--trainer.max_steps=-5"], "trainer.max_steps: expected -1 or more"),
         ([*FIT, f"--{CHECKPOINT % 'every_n_train_steps: -1'}"], "configuration: Invalid value for every_n_train_steps=-1"),
         ([*FIT, "--model.seed=1"], "model.seed: expected 0 (data.seed), found 1"),

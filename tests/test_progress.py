@@ -57,6 +57,21 @@ def test_a_resumed_run_counts_from_where_it_was(capsys: pytest.CaptureFixture[st
     assert lines[-1].startswith("fit: 2 steps")
 
 
+def test_more_steps_than_expected_have_no_total(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    with bar("learning", 2) as advance:
+        for _ in range(5):
+            advance()
+    assert capsys.readouterr().err.splitlines()[-1].startswith("learning: 5 steps")
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    with bar("learning", 2) as advance:
+        for _ in range(5):
+            advance()
+        assert progress._SCREEN.display is not None
+        (task,) = progress._SCREEN.display.tasks
+        assert not task.finished
+        assert task.fields["steps"] == "5"
+
+
 def test_what_runs_inside_of_a_bar_writes_no_lines(capsys: pytest.CaptureFixture[str]) -> None:
     with bar("evaluation", None), bar("episodes", 10) as advance:
         advance(10)

@@ -1,4 +1,4 @@
-"""Seconds and longest silence of each command and Python block of README, as a person sees them in a terminal.
+"""Seconds and longest silence of each command and Python block of README, and of other verbs, as a person sees them in a terminal.
 
     python benchmarks/speed/readme.py [--out results/readme.json]
 
@@ -26,6 +26,21 @@ README, TABLE = Path("README.md"), Path("results/readme.md")
 PYTHON = "python -m ftl_lightning "
 SKIPPED = ("play",)
 """Verbs that do not end."""
+OTHERS = (
+    'generate navigation --task "go to red bowl" --count 5 --out red.safetensors',
+    "invert navigation red.safetensors --out red",
+    "explain --concept red/go_to_red_bowl.safetensors",
+    "concepts navigation",
+    "check red.safetensors",
+    "check five.npz --pretrained logs/own/fit/pretrained --learn true",
+    'sample --pretrained navigation --compose "go to bowl:1" --goal "go to bowl" --count 50 --execute true',
+    'sample --pretrained driving --compose "merge:1" --goal merge --count 10 --execute true',
+    'sample --pretrained tabletop --compose "pick green circle to book:1" --goal "pick green circle to book" --count 50'
+    " --execute true",
+    "invert --config conf/object_rearrangement.yaml",
+    "invert --config conf/agent.yaml --evaluation.samples 10",
+)
+"""Commands of other verbs, after those of README in the same folder."""
 
 
 def programs(text: str) -> Iterator[tuple[str, list[str]]]:
@@ -75,16 +90,15 @@ def main() -> None:
     chosen = parser.parse_args()
     measured, here = dict[str, dict[str, float]](), Path.cwd()
     with tempfile.TemporaryDirectory() as folder:
-        for title, arguments in programs(README.read_text(encoding="utf-8")):
+        others = ((f"`{words[:70]}`", [sys.executable, "-m", "ftl_lightning", *shlex.split(words)]) for words in OTHERS)
+        for title, arguments in (*programs(README.read_text(encoding="utf-8")), *others):
             os.chdir(here if "report" in arguments else folder)  # which reads results/
             measured[title] = run(arguments)
             os.chdir(here)
             print(title, measured[title], flush=True)
     write_text(chosen.out, json.dumps(measured, indent=1) + "\n")
     rows = [f"| {title} | {row['seconds']} s | {row['processor']} s | {row['silence']} s |" for title, row in measured.items()]
-    write_text(
-        TABLE, "\n".join(["| in README | seconds | processor seconds | longest silence |", "|---|---|---|---|", *rows]) + "\n"
-    )
+    write_text(TABLE, "\n".join(["| command | seconds | processor seconds | longest silence |", "|---|---|---|---|", *rows]) + "\n")
 
 
 if __name__ == "__main__":

@@ -39,7 +39,7 @@ from ftl_lightning.services.tensor_file import write_text
 from ftl_lightning.training.data import InversionData
 
 DOMAINS = ("object_rearrangement", "agent", "driving", "mocap", "tabletop")
-STEPS, ANCESTRAL = (5, 10, 15), (10, 15)
+STEPS, ANCESTRAL = (5, 10), (5, 7, 10)
 """Steps of DPM-Solver++, and of DDPM beside all."""
 PLANS, FRESH, EACH, TIMED, REPEATS = 50, 20, 8, 500, 3
 """Plans whose accuracy is measured, fresh demonstrations, plans from each of their states, timed plans, and timed calls."""
@@ -48,13 +48,12 @@ FRESH_SEED = 4000
 
 
 def samplers(temperature: float) -> dict[str, Sampling]:
-    """By name: DDPM with all steps, and fewer steps at several temperatures."""
-    fewer = [Sampling("dpm_solver", steps, factor * temperature) for steps in STEPS for factor in (0.25, 0.5, 1.0)]
-    ancestral = [Sampling("ddpm", steps, factor * temperature) for steps in ANCESTRAL for factor in (1.0, 1.5, 2.0)]
-    return {
-        f"{each.sampler} {each.steps}, {each.temperature:g}": each
-        for each in (Sampling("ddpm", 100, temperature), *ancestral, *fewer)
-    }
+    """By name: DDPM with all steps, and fewer steps, of a low temperature at several."""
+    low = 0 < temperature < 0.2
+    fewer = [Sampling("dpm_solver", steps, factor * temperature) for steps in STEPS for factor in ((0.5, 1.0) if low else (1.0,))]
+    ancestral = [Sampling("ddpm", steps, factor * temperature) for steps in ANCESTRAL for factor in ((1.5, 2.0) if low else (1.0,))]
+    every = Sampling("ddpm", 100, temperature), *ancestral, *fewer
+    return {f"{each.sampler} {each.steps}, {each.temperature:g}": each for each in every}
 
 
 def composition(model: FewShot, task: EvaluationTask, learned: Mapping[str, Composition]) -> Composition:

@@ -23,7 +23,7 @@ from ftl_lightning.evaluation.evaluator import Evaluator
 from ftl_lightning.services import log_folder, trust
 from ftl_lightning.services.command_line import Arguments
 from ftl_lightning.services.configuration import parts
-from ftl_lightning.services.errors import UserError, mistake_behind, short
+from ftl_lightning.services.errors import UserError, mistake_behind, require, short
 from ftl_lightning.services.text import say
 from ftl_lightning.services.validation import check_range
 from ftl_lightning.training.board import TrainingBar, accuracies
@@ -129,10 +129,13 @@ class CommandLine(LightningCLI):
             return log_folder.claim(folder, name, new=self._verb == "invert")
         return name
 
+    def _model_folder(self) -> Path:
+        """Folder of the model that ``fit`` writes."""
+        return Path(self.model.hparams.get("output") or Path(self.trainer.log_dir or self.trainer.default_root_dir) / "pretrained")
+
     def after_fit(self) -> None:
         """Print the folder of the model."""
-        folder = self.model.hparams["output"] or Path(self.trainer.log_dir or self.trainer.default_root_dir) / "pretrained"
-        say(", ".join((f"pretrained model: {folder}", *accuracies(self.trainer))))
+        say(", ".join((f"pretrained model: {self._model_folder()}", *accuracies(self.trainer))))
 
     def after_invert(self) -> None:
         """Print the log folder."""
@@ -149,8 +152,9 @@ class CommandLine(LightningCLI):
     def before_fit(self) -> None:
         """Resolve ``last`` to the path of the last checkpoint; without any, the run starts from the beginning, with a note."""
         options = self.config_init[self._verb]
-        if options.get("ckpt_path"):
-            warnings.filterwarnings("ignore", message="Checkpoint directory .* exists and is not empty")  # as is meant
+        warnings.filterwarnings("ignore", message="Checkpoint directory .* exists and is not empty")  # as is meant
+        if self._verb == "fit" and not options.get("ckpt_path") and (self._model_folder() / "config.json").exists():
+            say(f"note: {self._model_folder()}: is replaced", error=True)
         if options.get("ckpt_path") == "last":
             options["ckpt_path"] = last_checkpoint(self.trainer)
             if options["ckpt_path"] is None and self._verb == "fit":
@@ -233,6 +237,8 @@ class _Parser(CommandLine):
 
 def run(verb: str, arguments: Arguments) -> None:
     """Parse and run one of Lightning's verbs or ``invert``."""
+    given = any(option in ("c", "config", "model", "model.class_path") or "help" in option for option, _ in arguments.options)
+    require(given, "config", "--config FILE, such as conf/own.yaml", "none")
     with one_voice(), log_folder.run():
         _command_line(CommandLine, verb, arguments, run=True)
 
@@ -288,7 +294,7 @@ def _command_line(kind: type[CommandLine], verb: str, arguments: Arguments, run:
             save_config_callback=_SaveConfig,
             save_config_kwargs={"overwrite": True},
             auto_configure_optimizers=False,  # modules configure their optimiser: model.learning_rate, model.weight_decay
-            parser_kwargs={"parser_mode": "omegaconf+", "exit_on_error": False},
+            parser_kwargs={"parser_mode": "omegaconf+", "exit_on_error": False, "allow_abbrev": False},
             run=run,
             args=[*([verb] if run else ()), *_null_in_groups(arguments).expanded(verb)],
         )

@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from ftl_lightning.services.errors import about, require
+from ftl_lightning.services.errors import about, note, require
+from ftl_lightning.services.progress import waiting
 from ftl_lightning.services.text import line, say
 from ftl_lightning.services.validation import LARGEST_STEP, check_count, check_range
 
@@ -60,14 +61,18 @@ def invert(options: InvertOptions) -> None:
     with about(options.demonstrations):
         demos = model.demonstrations(demos)
     files = concept_files(demos.concepts, Path(options.out), "out")
+    for path in filter(Path.exists, files.values()):
+        note(f"{path}: is replaced")
     changes = {"form": options.form} if options.form else {}
     with warnings.catch_warnings(record=True) as notes:
         warnings.simplefilter("always", UserWarning)
         learned = model.learn_all(demos, steps=options.steps or None, seed=options.seed, progress=True, **changes)
-    for note in notes:
-        say("note:", line(str(note.message)), error=True)
+    for warning in notes:
+        say("note:", line(str(warning.message)), error=True)
     for name, path in files.items():
-        write_concept(learned[name].concept, path, learned[name].inspection)
+        with waiting(f"{name}: quality of samples"):
+            quality = learned[name].inspection
+        write_concept(learned[name].concept, path, quality)
 
 
 @dataclass(frozen=True)
@@ -122,6 +127,9 @@ class SampleOptions:
         for name, path, endings in (("animation", self.animation, (".gif",)), ("figure", self.figure, (".png", ".svg", ".pdf"))):
             valid = not path or Path(path).suffix in endings
             require(valid, name, f"a name that ends in {' or '.join(endings)}", repr(path))
+        other = Path(self.concept).suffix not in ("", ".safetensors") and Path(self.concept).is_file()
+        advice = f"{self.concept!r}; to learn from demonstrations: python -m ftl_lightning invert MODEL FILE"
+        require(not other, "concept", "the file of a learned concept, .safetensors", advice)
         check_range("seed", self.seed, 0)
         check_count("count", self.count, 1, MOST_DRAWN if self.figure else MOST_SAMPLES)
         check_count("steps", self.steps, 0)
@@ -130,11 +138,13 @@ class SampleOptions:
 
 def sample(options: SampleOptions) -> None:
     """Generate behaviour as in ``options``; write, judge, draw and execute it."""
+    from ftl_lightning.data.demonstrations import writer
     from ftl_lightning.evaluation.pictures import captioned, gif
     from ftl_lightning.few_shot.learner import FewShot
     from ftl_lightning.services.tensor_file import atomic, write_text
     from ftl_lightning.training.quality import calibration_of
 
+    writer(options.out)  # refuses a format before the work
     model = FewShot.from_pretrained(options.pretrained, options.settings or None)
     text = " + ".join(part for part in (options.compose, options.concept) if part)
     known = model.compose(text) if text else None  # unknown concepts are reported before missing ones
@@ -149,6 +159,8 @@ def sample(options: SampleOptions) -> None:
     plans.save(options.out)
     # Without a configuration of the domain, the settings of invert must be given again.
     say(f"{options.out}: {len(plans)} samples; settings of {model.settings}")
+    if (maker := composition.uncomposed.made) is not None:
+        say(f"{composition.uncomposed.share:.0%} of the samples are {maker.name}, made without the model")
     for name, value in (model.evaluate(plans, goal) if goal and model.domain.metrics else {}).items():
         calibration = calibration_of(model.judging, goal, name)
         say(f"{name} on '{goal}': {value:.2f}{f' ({calibration})' if calibration else ''}")
@@ -198,6 +210,8 @@ def _check_sample(options: SampleOptions, domain: "Domain") -> None:
     if options.animation and not options.execute:
         expected = f"--execute true (plans of {domain.name} are not filmed)"
         require(domain.show.film, "animation", expected, repr(options.animation))
+    expected = f"no file, as models of {domain.name} observe no initial state"
+    require(domain.observed or not options.initial, "initial", expected, repr(options.initial))
     if domain.observed:
         expected = f"a task or a demonstrations file to start from (domain {domain.name})"
         require(options.initial or _start_task(options, domain), "goal, initial", expected, "neither")
@@ -265,8 +279,8 @@ def concepts(pretrained: str, folder: list[str] = [], plain: bool = False) -> No
         return
     if known.learned:
         say(f"\n{table(known.learned)}")
-    for note in known.notes:
-        say(line(note), error=True)
+    for text in known.notes:
+        say(line(text), error=True)
 
 
 def explain(concept: str, pretrained: str = "", nearest: int = 3) -> None:

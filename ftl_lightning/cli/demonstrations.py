@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ftl_lightning.services.errors import UserError, about, note, require
-from ftl_lightning.services.text import alike, line, say
+from ftl_lightning.services.text import alike, counted, line, say
 from ftl_lightning.services.validation import check_count, check_range
 
 if TYPE_CHECKING:
@@ -41,11 +41,13 @@ def generate(
             "minari:strokes/test-v0", or "lerobot:FOLDER" for a LeRobot data set (the extra "lerobot").
         root: folder of your copy of the data, for domains whose demonstrations do not ship.
     """
+    from ftl_lightning.data.demonstrations import writer
     from ftl_lightning.domains.registry import load_domain
 
     check_count("count", count, 1, MOST_DEMONSTRATIONS)
     check_range("seed", seed, 0)
     check_count("workers", workers, 1, MOST_WORKERS)
+    writer(out)  # refuses a format before the work
     loaded = load_domain(domain)
     source = loaded.source(Path(root) if root else None)
     try:
@@ -157,6 +159,8 @@ def check(options: CheckOptions) -> None:
         with atomic(options.figure) as temporary:
             check_figure(checks).savefig(temporary, dpi=110)
         say(options.figure)
+    errors = sum(finding.severity == "error" for each in checks for finding in each.findings)
+    require(not errors, options.file, "sound demonstrations", f"{counted(errors, 'error')}, see above")
 
 
 def _checked(model: "FewShot | None", demonstrations: "Demonstrations", faults: "tuple[Finding, ...]", learn: bool) -> "Check":

@@ -58,6 +58,7 @@ class Command:
             self.options or self.function,
             args=arguments.expanded(verb),
             exit_on_error=False,
+            allow_abbrev=False,
             as_positional=self.positional,
             prog=f"python -m ftl_lightning {verb}",
         )

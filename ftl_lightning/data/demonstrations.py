@@ -50,11 +50,11 @@ class Format:
 
     Attributes:
         read: reads a file, or a data set by its folder or name.
-        write: writes demonstrations under a name, atomically.
+        write: writes demonstrations under a name, atomically; ``None`` for a format that is only read.
     """
 
     read: Callable[[str], Contents]
-    write: Callable[["Demonstrations", str], None]
+    write: Callable[["Demonstrations", str], None] | None = None
 
 
 MOST_COLUMNS = 10_000
@@ -102,6 +102,14 @@ def _format(kind: str, name: str) -> Format:
     advice = f'{suffix}; convert it in Python: np.savez("file.npz", states=states, concepts=texts)'
     require(suffix not in FOREIGN, name, f"a file of {known}", advice)
     return FORMATS.get(suffix, FORMATS[".safetensors"])
+
+
+def writer(path: str | Path) -> tuple[Callable[["Demonstrations", str], None], str]:
+    """Function that writes demonstrations to a path, and the name to call it with; ``UserError`` for a format that is only read."""
+    kind, name = written_to(str(path))
+    if (write := _format(kind, name).write) is None:
+        raise UserError(f"{name}: expected the name of an .npz or .safetensors file, found a format that is only read")
+    return write, name
 
 
 @dataclass(frozen=True, repr=False)
@@ -366,8 +374,8 @@ class Demonstrations(Shown):
         Raises:
             UserError: naming the path, if it cannot be written or needs an extra that is not installed.
         """
-        kind, name = written_to(str(path))
-        _format(kind, name).write(self, name)
+        write, name = writer(path)
+        write(self, name)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:

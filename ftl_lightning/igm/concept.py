@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Self
 import torch
 from torch import Tensor
 
-from ftl_lightning.data.references import NAMES, Reference
+from ftl_lightning.data.references import NAMES, VARIED, Reference
 from ftl_lightning.igm.composition import Composition, space_of
 from ftl_lightning.igm.forms.adapter import LowRank
 from ftl_lightning.igm.forms.modes import STRETCH, Modes
@@ -139,7 +139,9 @@ class Choice:
         skills = self.skills
         if self.form not in skills:
             return ""
-        others = sorted(((skills[name], name) for name in (*NAMES, KNOWN) if name in skills and name != self.form), reverse=True)
+        others = sorted(
+            ((skills[name], name) for name in (*NAMES, VARIED, KNOWN) if name in skills and name != self.form), reverse=True
+        )
         beside = ", ".join(f"{name} {value:.2f}" for value, name in others)
         said = f"{self.form} has skill {skills[self.form]:.2f} on left-out demonstrations (without learning: {beside})"
         share = self.nearer.get(self.form)

@@ -130,15 +130,20 @@ class _Bar:
     def show(self) -> None:
         self.first = self.done
         if _SCREEN.display is not None:
-            self.task = _SCREEN.display.add_task(self.title, total=self.total, completed=self.done, steps=self._steps(), note="")
+            # rich stops the clock of a bar that is full, while work goes on.
+            total = None if self.total is None else self.total + 1e-3
+            self.task = _SCREEN.display.add_task(self.title, total=total, completed=self.done, steps=self._steps(), note="")
         elif self.lines:
             say(f"{self.title}: {self._steps()}" if self.total else self.title, error=True)
 
     def advance(self, steps: int = 1, note: str = "") -> None:
         before, self.done = self.done, self.done + steps
         self.note = plain(note) or self.note
+        if self.total and self.done > self.total:  # the end is unknown from now on
+            self.total = 0
         if _SCREEN.display is not None and self.task is not None:
-            _SCREEN.display.update(self.task, advance=steps, steps=self._steps(), note=self.note)  # type: ignore[arg-type]
+            longer = 2 * self.done if self.total == 0 else None
+            _SCREEN.display.update(self.task, advance=steps, total=longer, steps=self._steps(), note=self.note)  # type: ignore[arg-type]
         elif self.lines and self.total and LINES * before // self.total < LINES * self.done // self.total < LINES:
             say(f"{self.title}: {self._steps()}, {self._time()}", error=True)
 
@@ -149,11 +154,11 @@ class _Bar:
     def end(self) -> None:
         if self.lines:
             count = self.done - self.first
-            steps = f"{count} step{'' if count == 1 else 's'}, " if self.total else ""
+            steps = "" if self.total is None else f"{count} step{'' if count == 1 else 's'}, "
             say(f"{self.title}: {steps}{self._time()}", error=True)
 
     def _steps(self) -> str:
-        return f"{self.done}/{self.total}" if self.total else ""
+        return f"{self.done}/{self.total}" if self.total else f"{self.done}" if self.done else ""
 
     def _time(self) -> str:
         """Elapsed time, and the text of the last step."""

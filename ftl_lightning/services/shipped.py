@@ -51,6 +51,7 @@ def missing_model(place: str | Path) -> str:
     place = short(str(place), 80)
     normalised = place.lower().replace(" ", "_").replace("-", "_").removeprefix("pretrained/")
     near = difflib.get_close_matches(normalised, [*list_models(baselines=True), *TOPICS], n=2)
+    near = [str(inside) for inside in (Path(place) / "pretrained",) if (inside / "config.json").is_file()] or near
     ship = f"did you mean {' or '.join(near)}? shipped models:" if near else f"{', '.join(shipped_models())} ship, see"
     return (
         f"{Path(place) / 'config.json'}: expected a pretrained model, found nothing; {ship} ftl_lightning.list_models(); "

@@ -18,6 +18,7 @@ from ftl_lightning.igm.explanation import formula
 from ftl_lightning.igm.forms.choice import LEARNED, combined, learn
 from ftl_lightning.igm.forms.combination import Combination
 from ftl_lightning.igm.forms.leave_one_out import LeaveOneOut, find_outlier, leave_one_out, relative_losses
+from ftl_lightning.igm.inversion import Tell
 from ftl_lightning.igm.settings import AUTO, InversionSettings
 from ftl_lightning.services.errors import about, require, short
 from ftl_lightning.services.progress import bar
@@ -190,7 +191,8 @@ def check_with(
         find = find_outlier if own is None else lambda losses: outlier
         with bar(f"{name}: learning from some", steps) if progress else nothing as advance:
             left = leave_one_out(model, demonstrations, settings, steps, lambda loss: advance(1, f"loss {loss:.3g}"), find)
-        learned = None if own is None else _best_learned(model, demonstrations, settings, steps)
+        with bar(f"{name}: forms", None, lines=False) if progress else nothing as advance:
+            learned = None if own is None else _best_learned(model, demonstrations, settings, steps, lambda loss: advance(1))
     enough = None if own is None else Enough.of(demonstrations, model.horizon, own, learned, faulty(faults), model.places)
     ordered = tuple(sorted(faults, key=lambda finding: finding.severity == "note"))
     return Check(name, demonstrations, ordered, known, left, combination_line(model, demonstrations, settings), enough, own is None)
@@ -202,10 +204,10 @@ def faulty(findings: Iterable[Finding]) -> set[int]:
 
 
 def _best_learned(
-    model: ConceptModel, demonstrations: Demonstrations, settings: InversionSettings, steps: int
+    model: ConceptModel, demonstrations: Demonstrations, settings: InversionSettings, steps: int, tell: Tell
 ) -> tuple[str, float] | None:
     """The learned form with the highest skill, if it is better than every reference, and its skill."""
-    (concept,) = learn(model, demonstrations, settings.changed(form=AUTO), steps).values()
+    (concept,) = learn(model, demonstrations, settings.changed(form=AUTO), steps, tell).values()
     skills = {} if concept.choice is None else concept.choice.skills
     named = [name for name in skills if name in (*LEARNED, *NAMES, KNOWN)]
     best = max(named, key=lambda name: skills[name], default="")
@@ -312,6 +314,6 @@ def check_concept(model: ConceptModel, concept: Concept, path: str | Path) -> No
     of_model = {"encoder": model.config.encoder, "domain": model.config.domain, "pretrained": model.hash}
     for key, expected in of_model.items():
         value, wanted = getattr(concept.origin, key), f"{expected!r} (the pretrained model's)"
-        require(value == expected, f"{path}: key {key!r}", wanted, f"{short(value)!r}; learn it again")
+        require(value == expected, f"{path}: key {key!r}", wanted, f"{short(value)!r}; give its own model, or learn it again")
     with about(path):
         model.check_sizes(concept)

@@ -316,6 +316,8 @@ class OwnData(PretrainingData):
         if horizon is None and self.horizon < longest and PRESENT not in self.domain.observed:
             text = f"demonstrations have up to {longest} steps, so plans are windows of {self.horizon}"
             note(f"data.horizon: {text}; --data.horizon N makes them longer or shorter")
+        if self.horizon > 2 * longest:
+            note(f"data.horizon: demonstrations have at most {longest} steps, so most of a plan of {self.horizon} steps is at rest")
         for text in alike(self.domain.concepts.training):
             note(f"{demonstrations}: {text}")
 

@@ -31,7 +31,7 @@ import torch
 from numpy.typing import NDArray
 
 from ftl_lightning.data.actions import action_columns, held_actions
-from ftl_lightning.data.demonstrations import FORMATS, OBSERVED, Contents, Demonstrations, Format, gathered, stacked
+from ftl_lightning.data.demonstrations import FORMATS, OBSERVED, Contents, Format, gathered, stacked
 from ftl_lightning.data.features import check_single, check_whole, precise
 from ftl_lightning.data.formats.files import (
     DAMAGED,
@@ -288,6 +288,9 @@ def _read(name: str, kind: str, load: Callable[[Path, int], Arrays]) -> Contents
         with about(path):
             arrays = load(path, size)
     except (*DAMAGED, ArithmeticError, AssertionError, ImportError) as error:
+        if "Object arrays" in str(error):
+            expected = "arrays of numbers or texts, found Python objects; pad recordings to one length, and give 'lengths'"
+            raise UserError(f"{path}: expected {expected}") from error
         raise UserError(f"{path}: expected {kind}, found a damaged or foreign file ({short(str(error), 100)})") from error
     with about(path):
         return contents_of_arrays(arrays, name)
@@ -534,17 +537,13 @@ def _check_texts(column: "pd.Series", rows: NDArray[Any], look: int) -> None:
         raise UserError(f"{place}: expected numbers such as 1234.5, found {found}")
 
 
-def _not_written(demonstrations: Demonstrations, name: str) -> None:
-    raise UserError(f"{name}: expected the name of an .npz or .safetensors file, found a format that is only read")
-
-
 FORMATS |= {
     ".npz": Format(partial(_read, kind="an .npz of plain arrays", load=_npz), write_npz),
-    ".npy": Format(partial(_read, kind="an array of NumPy", load=_npy), _not_written),
-    ".json": Format(partial(_read, kind="arrays in JSON", load=_json), _not_written),
-    ".mat": Format(partial(_read, kind="variables of MATLAB up to version 7", load=_mat), _not_written),
-    ".csv": Format(partial(_read, kind="a table", load=_csv), _not_written),
-    ".parquet": Format(partial(_read, kind="a Parquet table", load=_parquet), _not_written),
-    **dict.fromkeys((".h5", ".hdf5"), Format(partial(_read, kind="an HDF5 file", load=_hdf5), _not_written)),
-    **dict.fromkeys((".pt", ".pth"), Format(partial(_read, kind="tensors of torch", load=_torch), _not_written)),
+    ".npy": Format(partial(_read, kind="an array of NumPy", load=_npy)),
+    ".json": Format(partial(_read, kind="arrays in JSON", load=_json)),
+    ".mat": Format(partial(_read, kind="variables of MATLAB up to version 7", load=_mat)),
+    ".csv": Format(partial(_read, kind="a table", load=_csv)),
+    ".parquet": Format(partial(_read, kind="a Parquet table", load=_parquet)),
+    **dict.fromkeys((".h5", ".hdf5"), Format(partial(_read, kind="an HDF5 file", load=_hdf5))),
+    **dict.fromkeys((".pt", ".pth"), Format(partial(_read, kind="tensors of torch", load=_torch))),
 }
