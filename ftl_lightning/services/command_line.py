@@ -215,7 +215,7 @@ _NOISE = (
 _PLAIN = (
     (r"""(?:Parser )?[Kk]ey "([\w.]+)": """, r"key '\1': "),
     (r"Problem with given class_path '[\w.]*?(\w+)': ", r"\1: "),
-    (r"\w+Data: the following arguments are required: (\w+)", r"found no \1; give --data.\1"),
+    (r"\b\w{1,40}Data: the following arguments are required: (\w+)", r"found no \1; give --data.\1"),
     (r"the following arguments are required: demonstrations$", "expected a model, then a file of demonstrations"),
     (r"Option '(\S+)' is not accepted", r"argument '\1' is not accepted; mend its name"),
     (r"(?:Subcommand|Group) '(\w+)' does not accept option '(\S+)'", r"key '\2' is not accepted; mend its name"),

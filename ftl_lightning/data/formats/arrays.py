@@ -289,8 +289,8 @@ def _read(name: str, kind: str, load: Callable[[Path, int], Arrays]) -> Contents
             arrays = load(path, size)
     except (*DAMAGED, ArithmeticError, AssertionError, ImportError) as error:
         if "Object arrays" in str(error):
-            expected = "arrays of numbers or texts, found Python objects; pad recordings to one length, and give 'lengths'"
-            raise UserError(f"{path}: expected {expected}") from error
+            advice = "pad recordings to one length, and give 'lengths'"
+            raise UserError(f"{path}: expected {kind}, found Python objects; {advice}") from error
         raise UserError(f"{path}: expected {kind}, found a damaged or foreign file ({short(str(error), 100)})") from error
     with about(path):
         return contents_of_arrays(arrays, name)
