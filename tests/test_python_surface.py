@@ -271,7 +271,7 @@ WRONG: list[tuple[Callable[[Things], Any], str]] = [
     (lambda of: FewShot.from_pretrained("pretrained/agnt"), "did you mean agent? shipped models: ftl_lightning.list_models()"),
     (
         lambda of: FewShot.from_pretrained("chess"),
-        "agent, driving, driving_wide, mocap, object_rearrangement, strokes, tabletop, tabletop_wide ship",
+        "agent, driving, driving_wide, mocap, mocap_root, object_rearrangement, strokes, tabletop, tabletop_wide ship",
     ),
     (lambda of: FewShot.from_pretrained("/nowhere/at/all"), "config.json: expected a pretrained model, found nothing"),
     (lambda of: FewShot.from_pretrained("./mine/model"), "config.json: expected a pretrained model, found nothing"),

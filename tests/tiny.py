@@ -7,7 +7,7 @@ import numpy as np
 from tests.conftest import CONF
 from tests.domains.mocap_samples import folder
 
-OURS = ("agent", "driving", "driving_wide", "mocap", "object_rearrangement", "own", "tabletop", "tabletop_wide")
+OURS = ("agent", "driving", "driving_wide", "mocap", "mocap_root", "object_rearrangement", "own", "tabletop", "tabletop_wide")
 CONFIGURATIONS = [Path(f"{domain}.yaml") for domain in OURS] + sorted(
     path.relative_to(CONF) for method in ("bc", "cvae", "in_context") for path in (CONF / method).glob("*.yaml")
 )
@@ -20,6 +20,7 @@ DATA = {
     "driving": FEW,
     "driving_wide": FEW,
     "mocap": [],
+    "mocap_root": [],
     "own": [],
     "tabletop": ONE,
     "tabletop_wide": ONE,
@@ -31,6 +32,7 @@ NETWORK = {
     "driving": [f"--model.denoiser_args={{{MLP}, initial_encoder: set, initial_dim: 16, dropout: 0.1}}"],
     "driving_wide": [f"--model.denoiser_args={{{MLP}, initial_encoder: entities, initial_dim: 16}}"],
     "mocap": [f"--model.denoiser_args={{{UNET}, skip: true, smooth: 2}}"],
+    "mocap_root": [f"--model.denoiser_args={{{UNET}, skip: true, smooth: 2}}"],
     "object_rearrangement": [f"--model.denoiser_args={{{MLP}, dropout: 0.1}}"],
     "own": [f"--model.denoiser_args={{{MLP}, dropout: 0.1}}"],
     "tabletop": [f"--model.denoiser_args={{{MLP}, initial_dim: 16}}"],
@@ -55,7 +57,7 @@ def fit(path: Path, *options: str) -> list[str]:
 
     domain, method = path.stem, path.parent.name or path.stem
     arguments = ["fit", f"--config={CONF / path}", *DATA[domain], *NETWORK[method], *QUIET]
-    if domain == "mocap":
+    if domain.startswith("mocap"):
         recordings = Path("recordings").absolute()
         arguments += [f"--data.root={recordings if recordings.is_dir() else folder(recordings, TRAINING_CONCEPTS)}"]
     if domain == "own":

@@ -100,7 +100,7 @@ def test_compositions_of_navigation_are_judged_on_the_validation_suites_targets(
     assert not set(suites["compositions"].learned) & {*suites["paper"].learned, *suites["validation"].learned}
 
 
-BUILT_IN = ("agent", "driving", "driving_wide", "mocap", "object_rearrangement", "tabletop", "tabletop_wide")
+BUILT_IN = ("agent", "driving", "driving_wide", "mocap", "mocap_root", "object_rearrangement", "tabletop", "tabletop_wide")
 MODULE = """
 from dataclasses import replace
 from ftl_lightning.domains.object_rearrangement import DOMAIN as OTHER

@@ -101,7 +101,7 @@ def test_a_domain_that_is_not_installed_is_used_by_its_module(strokes: Domain, c
     refused(capsys, sample, "give --trust ftl_strokes")  # a folder names no code: a person does
     succeed(*sample, "--trust=ftl_strokes")
     succeed(*sample, f"--settings={EXAMPLE / 'strokes_invert.yaml'}", "--trust=ftl_strokes")
-    names = "agent, driving, driving_wide, mocap, object_rearrangement, tabletop, tabletop_wide"
+    names = "agent, driving, driving_wide, mocap, mocap_root, object_rearrangement, tabletop, tabletop_wide"
     refused(capsys, ["generate", "strokes"], f"domain: expected one of {names}, or package.module:DOMAIN, found 'strokes'")
 
 

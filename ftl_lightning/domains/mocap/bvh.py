@@ -229,22 +229,26 @@ _PLACE, _TURN = "Xposition Yposition Zposition", "Zrotation Yrotation Xrotation"
 
 
 def bvh(states: Tensor) -> str:
-    """Convert a motion ``(frame, 42)`` in metres to the text of a BVH file; raise a ``UserError`` for numbers that are not finite.
+    """Convert a motion ``(frame, 42)`` or ``(frame, 46)`` to the text of a BVH file.
+
+    Raises:
+        UserError: for numbers that are not finite.
 
     In the file y is up, the person faces +z, +x is the person's left, and the unit is the metre. The root is the middle of the
-    hips, see :func:`_grounded`. Joints rotate; joints without rigid bone to the parent (shoulders, neck, head) also have a position
-    per frame, as in Blender. Bones have the lengths of the first frame and the rest directions of a standing pose. Rotations
-    between frames are minimal, so that no arm spins about its axis.
+    hips; without root see :func:`_grounded`. Joints rotate; joints without rigid bone to the parent (shoulders, neck, head) also
+    have a position per frame, as in Blender. Bones have the lengths of the first frame and the rest directions of a standing pose.
+    Rotations between frames are minimal, so that no arm spins about its axis.
     """
     require(states.isfinite().all(), "export", "motion of finite numbers", "others; draw it again with another --seed")
     places = _places(states)
+    root = places[:, HIPS] if skeleton.has_root(states) else _grounded(places)
     (rest,) = _places(standing_poses(1, torch.Generator().manual_seed(0)))
     turns: list[Numbers] = []  # of each joint in the file's axes, (frame, 3, 3)
     offsets, ends, rows = [], [], []
     for joint in TREE:
         parent = HIPS if joint.parent < 0 else TREE[joint.parent].place
         above = turns[joint.parent] if joint.parent >= 0 else np.broadcast_to(np.eye(3), (len(places), 3, 3))
-        moved = _seen(above, places[:, joint.place] - places[:, parent]) if joint.parent >= 0 else _grounded(places)
+        moved = _seen(above, places[:, joint.place] - places[:, parent]) if joint.parent >= 0 else root
         offsets.append(_sized(rest[joint.place] - rest[parent], moved[0]) if joint.parent >= 0 else np.zeros(3))
         turn = np.broadcast_to(np.eye(3), (len(places), 3, 3))
         ends.append(np.array([0, TIP, 0]))
@@ -261,7 +265,8 @@ def bvh(states: Tensor) -> str:
 
 def _places(states: Tensor) -> Numbers:
     """Positions of the joints and the middle of the hips ``(frame, 15, 3)``, in the file's axes."""
-    joints = as_joints(states.detach().cpu()).double().numpy()
+    states = states.detach().cpu().double()
+    joints = (skeleton.in_space if skeleton.has_root(states) else as_joints)(states).numpy()
     joints = np.stack((-joints[..., 0], joints[..., 2], joints[..., 1]), axis=-1)
     middle = joints[:, list(skeleton.HIPS)].mean(axis=1, keepdims=True)
     return np.concatenate((joints, middle), axis=1)

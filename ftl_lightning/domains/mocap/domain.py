@@ -2,12 +2,13 @@
 
 import itertools
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from ftl_lightning.data.features import InitialStates, Observed, check_starts
+from ftl_lightning.data.features import Feature, InitialStates, Observed, check_starts
 from ftl_lightning.domains.comparison import OURS, WITH_ADAPTER, WITH_KNOTS, WITH_MODES, Compared, Comparison
 from ftl_lightning.domains.domain import ACCURACY, Concepts, Domain, Metric, Plans, Recordings, View, deferred
 from ftl_lightning.domains.mocap.judge import identity
@@ -20,9 +21,14 @@ from ftl_lightning.domains.mocap.skeleton import (
     OBSERVED,
     POSE,
     RIGID,
+    ROOT,
+    ROOTED_NAME,
     as_joints,
+    at_rest_with_root,
     drawn_poses,
+    has_root,
     mean_pose,
+    with_joints,
 )
 from ftl_lightning.domains.mocap.source import Recorded
 from ftl_lightning.domains.mocap.tasks import NEW_CONCEPTS, SUITES, TESTED, TRAINING_CONCEPTS, action, judged
@@ -48,7 +54,7 @@ def with_rigid_bones(states: Tensor, observed: Observed) -> Tensor:
         if (inner, outer) == HIPS:
             moved[inner] = -bone / 2
         moved[outer] = moved[inner] + bone
-    return torch.stack(moved, dim=-2).flatten(-2)
+    return with_joints(states, torch.stack(moved, dim=-2))
 
 
 def smoothed(states: Tensor, observed: Observed) -> Tensor:
@@ -81,13 +87,14 @@ def begun_elsewhere(states: Tensor, observed: Observed, draw: torch.Generator | 
         return states, observed
     count, device = len(states), states.device
     poses = with_rigid_bones(drawn(count, lambda n: drawn_poses(n, draw)).to(states)[:, None], observed)
+    poses = at_rest_with_root(poses) if has_root(states) else poses
     low, high = BLENDED
     length = drawn(count, lambda n: torch.randint(low, high + 1, (n, 1, 1), generator=draw, device=draw.device)).to(device)
     share = torch.arange(states.shape[1], device=device)[None, :, None] / length
     elsewhere = (drawn(count, lambda n: torch.rand((n, 1, 1), generator=draw, device=draw.device)) < SHARE).to(device)
     weight = elsewhere * _fade(share)
     begun = torch.where(weight > 0, with_rigid_bones(weight * poses + (1 - weight) * states, observed), states)
-    return begun, {**observed, POSE: begun[:, 0]}
+    return begun, {**observed, POSE: begun[:, 0, : len(COLUMNS)]}
 
 
 def _encode_steps(states: Tensor, observed: Observed) -> Tensor:
@@ -113,9 +120,10 @@ _RIGID = View(
 
 
 def _fading(states: Tensor, observed: Observed) -> Tensor:
-    """Initial pose less the mean pose ``(sample, frame, 42)``, which fades out over the frames of a transition."""
+    """Initial pose less the mean pose, which fades out over the frames of a transition; zero for the root. As states."""
     share = torch.arange(states.shape[1], device=states.device) / (sum(BLENDED) / 2)
-    return _fade(share)[None, :, None] * (observed[POSE] - mean_pose().to(states))[:, None]
+    fading = _fade(share)[None, :, None] * (observed[POSE] - mean_pose().to(states))[:, None]
+    return torch.nn.functional.pad(fading, (0, states.shape[-1] - len(COLUMNS)))
 
 
 VIEWS = {
@@ -180,3 +188,28 @@ DOMAIN = Domain(
         imports={".bvh": deferred("ftl_lightning.domains.mocap.prepare:demonstrated")},
     ),
 )
+
+
+def _standing_still(goal: str, count: int, starts: InitialStates | None, seed: int) -> Tensor:
+    """Plans with root, without motion."""
+    return at_rest_with_root(_frozen(goal, count, starts, seed))
+
+
+_POSE_ALONE = {POSE: Feature((len(COLUMNS),))}  # not a whole state, as the root's motion is not observed
+ROOTED = replace(
+    DOMAIN,
+    name=ROOTED_NAME,
+    plans=replace(
+        DOMAIN.plans,
+        columns=(*COLUMNS, *ROOT),
+        units=(*DOMAIN.plans.units, "m", "m", "m", "rad"),
+        groups={**GROUPS, "legs": (*GROUPS["legs"], *range(len(COLUMNS), len(COLUMNS) + len(ROOT)))},
+        views={name: replace(view, features=_POSE_ALONE) for name, view in VIEWS.items() if name != "steps"},
+    ),
+    source=partial(Recorded, rooted=True),
+    observed=_POSE_ALONE,
+    metrics={**DOMAIN.metrics, "skating": Metric(deferred(f"{_MEASURES}:skating"), less_is_better=True)},
+    comparison=replace(DOMAIN.comparison, references={"frozen frame": _standing_still}),
+    recordings=replace(DOMAIN.recordings, imports={".bvh": deferred("ftl_lightning.domains.mocap.prepare:demonstrated_with_root")}),
+)
+"""Human motion with the path of the root over the ground."""

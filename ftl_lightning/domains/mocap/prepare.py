@@ -233,10 +233,13 @@ def _index(root: Path) -> dict[str, str]:
     return descriptions
 
 
-def demonstrated(path: Path) -> Demonstrations:
+def demonstrated(path: Path, rooted: bool = False) -> Demonstrations:
     """Demonstrations, without text, from a file of ``sample --export``, at any frame rate, or of the conversion.
 
-    Each is a piece without glitches. A ``UserError`` for a file that is damaged, of another skeleton, or shorter than a plan.
+    Each is a piece without glitches, with the root if ``rooted``.
+
+    Raises:
+        UserError: for a file that is damaged, of another skeleton, or shorter than a plan.
     """
     motion = read_motion(path)
     if motion.names.issuperset(CONVERTED):
@@ -246,11 +249,15 @@ def demonstrated(path: Path) -> Demonstrations:
         for name in EXPORTED:
             require(name in motion.names, str(path), expected, f"a skeleton without {name!r}")
         joints = motion.places(EXPORTED)
-    states = normalised(z_up(_at_rate(joints, motion.seconds))).states
+    poses = normalised(z_up(_at_rate(joints, motion.seconds)))
+    states = poses.rooted if rooted else poses.states
     parts = pieces(states)
     expected = f"a motion of {HORIZON} frames or more at {FPS} a second, without jumps"
     require(parts, str(path), expected, f"{len(states)} frames")
     return source.moving(parts, [""] * len(parts), {"generator": "BVH file", "file": path.name})
+
+
+demonstrated_with_root = functools.partial(demonstrated, rooted=True)
 
 
 def _at_rate(joints: NDArray[np.float64], seconds: float) -> NDArray[np.float64]:

@@ -29,10 +29,14 @@ COLOURS = tuple(TRUNK if {*bone} <= _TRUNK else RIGHT if bone[0] in skeleton.RIG
 
 
 def wireframe(states: Tensor) -> Wireframe:
-    """Wireframe of a motion ``(frame, 42)`` in metres on a floor.
+    """Wireframe of a motion ``(frame, 42)`` or ``(frame, 46)`` on a floor.
 
-    The floor is unknown, and below the lowest joint in every frame: squats come down, and jumps only stretch.
+    Without root the floor is unknown, and below the lowest joint in every frame: squats come down, and jumps only stretch. With
+    root people move over the floor.
     """
+    if skeleton.has_root(states):
+        moving = np.ascontiguousarray(skeleton.in_space(states.detach().cpu()).numpy(), dtype=np.float32)
+        return Wireframe(moving + np.array((0, 0, SOLE), dtype=np.float32), BONES, COLOURS, ((skeleton.HEAD, HEAD, TRUNK),), FPS)
     points = np.ascontiguousarray(as_joints(states.detach().cpu()).numpy(), dtype=np.float32)
     up = np.zeros(3, dtype=np.float32)
     up[2] = 1
@@ -41,12 +45,12 @@ def wireframe(states: Tensor) -> Wireframe:
 
 
 def film(states: Tensor) -> list[NDArray[np.uint8]]:
-    """Frames ``(240, 240, 3)`` of a motion ``(frame, 42)`` in metres."""
+    """Frames ``(240, 240, 3)`` of a motion, see :func:`wireframe`."""
     return drawn(wireframe(states))
 
 
 def picture(states: Tensor, right: Sequence[bool] | None, title: str, starts: InitialStates | None) -> Figure:
-    """Strips of poses over time from left to right, of the first :data:`MAX_SAMPLES` of ``(sample, frame, 42)`` in metres.
+    """Strips of poses over time from left to right, of the first :data:`MAX_SAMPLES` of ``(sample, frame, 42)``, without root.
 
     Frames show success per sample: green, red, or grey for ``None``. Plans start with the initial poses ``starts``.
     """
@@ -56,7 +60,7 @@ def picture(states: Tensor, right: Sequence[bool] | None, title: str, starts: In
     figure.suptitle(figure_text(heading), fontsize=9)
     panels = figure.subplots(len(shown), 1, squeeze=False).flat
     for axes, plan, frame in zip(panels, shown, frame_colours(len(states), right), strict=False):
-        _strip(axes, wireframe(plan), frame)
+        _strip(axes, wireframe(plan[:, : len(skeleton.COLUMNS)]), frame)
     for colour, label in ((LEFT, "left"), (RIGHT, "right"), (TRUNK, "trunk")):
         figure.axes[0].plot([], [], color=colour, linewidth=2, label=label)
     figure.legend(loc="outside lower center", ncols=3, fontsize=7, frameon=False, handlelength=1.2)

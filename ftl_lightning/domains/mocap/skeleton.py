@@ -1,6 +1,7 @@
 """Body: the 14 joints of the paper's renderer (jutanke/mocap), the last two the ends of lower neck and head.
 
-In every frame the middle of the hips is the origin, z is up, +y is where the hips face and +x the person's right.
+In every frame the middle of the hips is the origin, z is up, +y is where the hips face and +x the person's right. States with root
+also have its path, see :data:`ROOT`.
 """
 
 from functools import cache
@@ -20,7 +21,10 @@ JOINTS = (
     "HeadTop",
 )  # fmt: skip
 COLUMNS = tuple(f"{joint}.{axis}" for joint in JOINTS for axis in "xyz")  # Columns of a state, in metres
-NAME = "mocap"
+ROOT = ("Root.right", "Root.forward", "Root.height", "Root.turn")
+"""Columns of the root: since the frame before, displacement of the middle of the hips in metres to the right and forwards of that
+frame, and turn to the left in radians; height in metres above the level at which ankles rest on the ground."""
+NAME, ROOTED_NAME = "mocap", "mocap_root"
 POSE = "pose"  # Observed feature: the joints at the start of a plan, which are the plan's first state
 OBSERVED = {POSE: Feature((len(COLUMNS),), state=tuple(range(len(COLUMNS))))}
 FPS = 30  # Frames per second
@@ -54,14 +58,52 @@ GROUPS = {"arms": _columns(*ELBOWS, *WRISTS), "legs": _columns(*HIPS, *KNEES, *A
 
 
 def as_joints(states: Tensor) -> Tensor:
-    """States ``(..., 42)`` as joints ``(..., 14, 3)``."""
-    return states.unflatten(-1, (len(JOINTS), 3))
+    """States ``(..., 42)``, or with root ``(..., 46)``, as joints ``(..., 14, 3)`` around the root."""
+    return states[..., : len(COLUMNS)].unflatten(-1, (len(JOINTS), 3))
+
+
+def with_joints(states: Tensor, joints: Tensor) -> Tensor:
+    """States with other joints ``(..., 14, 3)``; the root, if there is any, is kept."""
+    return torch.cat((joints.flatten(-2), states[..., len(COLUMNS) :]), dim=-1)
+
+
+def has_root(states: Tensor) -> bool:
+    """Whether states have the columns of the root."""
+    return states.shape[-1] > len(COLUMNS)
+
+
+def at_rest_with_root(poses: Tensor) -> Tensor:
+    """Poses ``(..., 42)`` as states ``(..., 46)`` of people who stand on the lower foot and do not move."""
+    height = -as_joints(poses)[..., list(ANKLES), 2].amin(dim=-1, keepdim=True)
+    still = torch.zeros_like(height)
+    return torch.cat((poses, still, still, height, still), dim=-1)
+
+
+def in_space(states: Tensor) -> Tensor:
+    """Joints ``(..., frame, 14, 3)`` in metres of states with root ``(..., frame, 46)``: the first frame is above the origin and
+    faces +y, the ground is z = 0.
+    """
+    right, forward, height, turn = (column[..., None] for column in states[..., len(COLUMNS) :].unbind(dim=-1))
+    steps = torch.cat((right, forward), dim=-1)[..., 1:, :]
+    yaw = torch.cat((torch.zeros_like(turn[..., :1, :]), turn[..., 1:, :].cumsum(dim=-2)), dim=-2)
+    path = _rotated(steps, yaw[..., :-1, :]).cumsum(dim=-2)
+    root = torch.cat((torch.nn.functional.pad(path, (0, 0, 1, 0)), height), dim=-1)
+    joints = as_joints(states)
+    return torch.cat((_rotated(joints[..., :2], yaw[..., None]), joints[..., 2:]), dim=-1) + root[..., None, :]
+
+
+def _rotated(points: Tensor, yaw: Tensor) -> Tensor:
+    """Points ``(..., 2)`` rotated to the left by angles ``(..., 1)`` in radians."""
+    x, y = points[..., :1], points[..., 1:]
+    return torch.cat((yaw.cos() * x - yaw.sin() * y, yaw.sin() * x + yaw.cos() * y), dim=-1)
 
 
 def mirrored(states: Tensor) -> Tensor:
-    """Motion ``(..., 42)`` with left and right exchanged."""
+    """Motion ``(..., 42)`` or ``(..., 46)`` with left and right exchanged."""
     joints = as_joints(states)[..., list(MIRROR), :]
-    return (joints * joints.new_tensor((-1.0, 1.0, 1.0))).flatten(-2)
+    root = states[..., len(COLUMNS) :]
+    other = root * root.new_tensor((-1.0, 1.0, 1.0, -1.0)[: root.shape[-1]])
+    return torch.cat(((joints * joints.new_tensor((-1.0, 1.0, 1.0))).flatten(-2), other), dim=-1)
 
 
 def bone_lengths(states: Tensor) -> Tensor:
@@ -82,6 +124,11 @@ class Poses(NamedTuple):
         """States ``(frame, 42)``."""
         return self.positions.astype(np.float32).reshape(-1, len(COLUMNS))
 
+    @property
+    def rooted(self) -> NDArray[np.float32]:
+        """States with root ``(frame, 46)``."""
+        return np.concatenate((self.states, root_columns(self.positions, self.root)), axis=1)
+
 
 def z_up(joints: NDArray[np.float64]) -> NDArray[np.float64]:
     """Convert points ``(..., 3)`` from y up to z up."""
@@ -100,6 +147,22 @@ def normalised(joints: NDArray[np.float64]) -> Poses:
     x, y, z = np.moveaxis(joints - middle[:, None], -1, 0)
     turned = np.stack((cosine * x + sine * y, cosine * y - sine * x, z), axis=-1)
     return Poses(turned, np.concatenate((middle, yaw[:, None]), axis=1))
+
+
+GROUND = 5
+"""Percentile of the height of the lower ankle in a trial that is the ground."""
+
+
+def root_columns(positions: NDArray[np.floating], root: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Columns :data:`ROOT` ``(frame, 4)`` of a trial, see :class:`Poses`; the first frame moves as the second."""
+    yaw = np.unwrap(root[:, 3].astype(np.float64))
+    step, turn = np.diff(root[:, :2].astype(np.float64), axis=0), np.diff(yaw)
+    cosine, sine = np.cos(yaw[:-1]), np.sin(yaw[:-1])
+    moved = np.stack((cosine * step[:, 0] + sine * step[:, 1], cosine * step[:, 1] - sine * step[:, 0], turn), axis=1)
+    moved = np.concatenate((moved[:1], moved)) if len(moved) else np.zeros((len(root), 3))
+    ankles = root[:, 2] + positions[:, list(ANKLES), 2].min(axis=1)
+    height = root[:, 2] - np.percentile(ankles, GROUND)
+    return np.stack((moved[:, 0], moved[:, 1], height, moved[:, 2]), axis=1).astype(np.float32)
 
 
 _RIGHT_LEG = ((0.09, 0.0, 0.0), (0.09, 0.02, -0.40), (0.09, -0.03, -0.83))  # hip, knee and ankle in metres, of a medium adult

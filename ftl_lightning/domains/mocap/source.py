@@ -19,7 +19,19 @@ from ftl_lightning.data.features import InitialStates
 from ftl_lightning.data.formats.files import check_arrays
 from ftl_lightning.domains.domain import Split
 from ftl_lightning.domains.mocap import skeleton, tasks
-from ftl_lightning.domains.mocap.skeleton import COLUMNS, FPS, HORIZON, JOINTS, NAME, POSE, mirrored
+from ftl_lightning.domains.mocap.skeleton import (
+    COLUMNS,
+    FPS,
+    HORIZON,
+    JOINTS,
+    NAME,
+    POSE,
+    ROOT,
+    ROOTED_NAME,
+    has_root,
+    mirrored,
+    root_columns,
+)
 from ftl_lightning.domains.mocap.tasks import DEMONSTRATORS, TRAINING_CONCEPTS, Segment
 from ftl_lightning.services.errors import UserError, require, short
 from ftl_lightning.services.files import check_readable
@@ -54,9 +66,11 @@ class Recordings:
     def __len__(self) -> int:
         return len(self.trial_id)
 
-    def trial(self, number: int) -> NDArray[np.float32]:
-        """States ``(frame, 42)`` of a trial."""
-        return self.positions[self.offsets[number] : self.offsets[number + 1]].reshape(-1, 3 * len(JOINTS))
+    def trial(self, number: int, rooted: bool = False) -> NDArray[np.float32]:
+        """States ``(frame, 42)`` of a trial, or with root ``(frame, 46)``."""
+        frames = slice(self.offsets[number], self.offsets[number + 1])
+        states = self.positions[frames].reshape(-1, len(COLUMNS))
+        return np.concatenate((states, root_columns(self.positions[frames], self.root[frames])), axis=1) if rooted else states
 
     def save(self, path: Path) -> None:
         """Write the recordings atomically."""
@@ -131,23 +145,24 @@ UPRIGHT = 0.35  # Minimum height in metres of shoulders above hips; half the min
 
 
 def moving(motions: Sequence[Tensor], concepts: Sequence[str], provenance: Mapping[str, object]) -> Demonstrations:
-    """Demonstrations from motions ``(frame, 42)`` in metres, with a text each."""
+    """Demonstrations from motions ``(frame, 42)`` or ``(frame, 46)``, with a text each."""
     states, lengths = padded(motions)
+    rooted = has_root(states)
     return Demonstrations(
         states=states,
         lengths=lengths,
-        domain=NAME,
-        state_names=COLUMNS,
-        state_units=("m",) * len(COLUMNS),
+        domain=ROOTED_NAME if rooted else NAME,
+        state_names=(*COLUMNS, *ROOT) if rooted else COLUMNS,
+        state_units=(*("m",) * (states.shape[-1] - 1), "rad") if rooted else ("m",) * len(COLUMNS),
         concepts=tuple(concepts),
-        observed={POSE: states},
+        observed={POSE: states[..., : len(COLUMNS)]},
         per_step=(POSE,),
         provenance=provenance,
     )
 
 
 class Piece(NamedTuple):
-    """Part of a trial without glitches: number of the trial, concept, and states ``(frame, 42)``, at least as long as a plan."""
+    """Part of a trial without glitches: number of the trial, concept, and states, at least as long as a plan."""
 
     trial: int
     concept: str
@@ -160,9 +175,15 @@ class Piece(NamedTuple):
 
 @dataclass(frozen=True)
 class Recorded:
-    """Recordings of a folder, read lazily; without a folder, a source of rule-based initial poses only."""
+    """Recordings of a folder, read lazily; without a folder, a source of rule-based initial poses only.
+
+    Attributes:
+        root: folder.
+        rooted: whether states have the columns of the body's root.
+    """
 
     root: Path | None
+    rooted: bool = False
 
     @property
     def recordings(self) -> Recordings:
@@ -241,11 +262,11 @@ class Recorded:
         """Poses ``(pose, 42)`` that start a window, per piece of a training concept's trials; empty if it has no trial."""
         shown = [piece for piece in self._pieces if piece.concept == concept]
         held_out = [piece for piece in shown if piece.trial in self._validation]
-        return tuple(piece.states[: len(piece.states) - HORIZON + 1] for piece in held_out or shown)
+        return tuple(piece.states[: len(piece.states) - HORIZON + 1, : len(COLUMNS)] for piece in held_out or shown)
 
     @cached_property
     def _pieces(self) -> list[Piece]:
-        return training_pieces(self.recordings)
+        return training_pieces(self.recordings, self.rooted)
 
     @cached_property
     def _validation(self) -> frozenset[int]:
@@ -257,7 +278,7 @@ class Recorded:
         for segment in self.segments:
             if segment.label == task and segment.trial_id in recordings.trial_id:
                 trial = recordings.trial_id.index(segment.trial_id)
-                parts = pieces(recordings.trial(trial)[segment.start : segment.stop], longest=None)
+                parts = pieces(recordings.trial(trial, self.rooted)[segment.start : segment.stop], longest=None)
                 own = shown.setdefault(recordings.subject[trial] in DEMONSTRATORS, [])
                 own += [Piece(trial, task, states) for states in parts]
         return shown.get(True) or shown.get(False, [])
@@ -279,10 +300,10 @@ def unused_reason(recordings: Recordings, trial: int) -> str:
     return ""
 
 
-def training_pieces(recordings: Recordings) -> list[Piece]:
-    """Pieces of training and validation trials, in the order of the trials."""
+def training_pieces(recordings: Recordings, rooted: bool = False) -> list[Piece]:
+    """Pieces of training and validation trials, in the order of the trials; ``rooted`` as in :class:`Recorded`."""
     used = [trial for trial in range(len(recordings)) if not unused_reason(recordings, trial)]
-    return [Piece(trial, recordings.label[trial], states) for trial in used for states in pieces(recordings.trial(trial))]
+    return [Piece(trial, recordings.label[trial], states) for trial in used for states in pieces(recordings.trial(trial, rooted))]
 
 
 def validation_trials(training: Sequence[Piece]) -> frozenset[int]:
@@ -294,7 +315,7 @@ def validation_trials(training: Sequence[Piece]) -> frozenset[int]:
 
 
 def pieces(states: NDArray[np.float32], longest: int | None = LONGEST) -> list[Tensor]:
-    """Parts of a trial ``(frame, 42)`` without glitches, each at least a window; longer ones in overlapping parts."""
+    """Parts of a trial ``(frame, column)`` without glitches, each at least a window; longer ones in overlapping parts."""
     parts = []
     for start, stop in pairwise((0, *glitches(states), len(states))):
         if stop - start < HORIZON:
@@ -307,16 +328,16 @@ def pieces(states: NDArray[np.float32], longest: int | None = LONGEST) -> list[T
 
 
 def glitches(states: NDArray[np.float32]) -> list[int]:
-    """Frames of a trial ``(frame, 42)`` that a joint reaches faster than :data:`MAX_SPEED`."""
-    joints = states.reshape(len(states), -1, 3)
+    """Frames of a trial ``(frame, 42)`` or ``(frame, 46)`` that a joint reaches faster than :data:`MAX_SPEED`, around the root."""
+    joints = states[:, : len(COLUMNS)].reshape(len(states), -1, 3)
     speed = np.linalg.norm(np.diff(joints, axis=0), axis=-1).max(axis=1, initial=0) * FPS
     return (np.flatnonzero(speed > MAX_SPEED) + 1).tolist()
 
 
 def at_rest(states: Tensor) -> list[int]:
-    """Start frames of windows in ``(frame, 42)``: local minima of the distance to standing, within :data:`CYCLE` frames."""
+    """Start frames of windows in ``(frame, column)``: local minima of the distance to standing, within :data:`CYCLE` frames."""
     (standing,) = skeleton.standing_poses(1, generator("cpu", 0))
-    distance = torch.linalg.vector_norm(states - standing, dim=1)
+    distance = torch.linalg.vector_norm(states[:, : len(COLUMNS)] - standing, dim=1)
     frames = range(len(states) - HORIZON + 1)
     return [frame for frame in frames if distance[frame] == distance[max(frame - CYCLE, 0) : frame + CYCLE + 1].min()]
 
