@@ -139,7 +139,7 @@ def measure(domain: Domain, suite: str, form: Form, seed: int, samples: int, out
     drawn = InversionData(domain.name, suite, seed=seed).demonstrations
     learned = dict.fromkeys(name for task in tasks for name in task.learned)
     module: Any = adapted(form, config, concatenate([drawn.select(concept) for concept in learned]), seed)
-    sampling = {key: config["evaluation"][key] for key in ("sampler", "steps")}
+    sampling: dict[str, Any] = {"sampler": "ddpm", "steps": 100}  # the paper's
     for temperature in missing:
         generation = Generation(samples, temperature=temperature or 0.0, seed=seed, **sampling)
         judged = generate(module, tasks, generation)

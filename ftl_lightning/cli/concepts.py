@@ -138,22 +138,24 @@ class SampleOptions:
 
 def sample(options: SampleOptions) -> None:
     """Generate behaviour as in ``options``; write, judge, draw and execute it."""
-    from ftl_lightning.data.demonstrations import writer
-    from ftl_lightning.evaluation.pictures import captioned, gif
-    from ftl_lightning.few_shot.learner import FewShot
-    from ftl_lightning.services.tensor_file import atomic, write_text
-    from ftl_lightning.training.quality import calibration_of
+    with waiting("loading"):
+        from ftl_lightning.data.demonstrations import writer
+        from ftl_lightning.evaluation.pictures import captioned, gif
+        from ftl_lightning.few_shot.learner import FewShot
+        from ftl_lightning.services.tensor_file import atomic, write_text
+        from ftl_lightning.training.quality import calibration_of
 
-    writer(options.out)  # refuses a format before the work
-    model = FewShot.from_pretrained(options.pretrained, options.settings or None)
+        writer(options.out)  # refuses a format before the work
+        model = FewShot.from_pretrained(options.pretrained, options.settings or None)
     text = " + ".join(part for part in (options.compose, options.concept) if part)
     known = model.compose(text) if text else None  # unknown concepts are reported before missing ones
     _check_sample(options, model.domain)
     composition = model.compose(text) if known is None else known
     goal, film = options.goal, model.domain.show.film
-    starts = _sample_starts(options, model.domain)
-    exported = _export_files(options.export, options.count if starts is None else len(starts))
-    plans = model.sample(composition, options.count if starts is None else None, starts, seed=options.seed, **_sampling(options))
+    with waiting("sampling"):
+        starts = _sample_starts(options, model.domain)
+        exported = _export_files(options.export, options.count if starts is None else len(starts))
+        plans = model.sample(composition, options.count if starts is None else None, starts, seed=options.seed, **_sampling(options))
     provenance = {**plans.provenance, "concept": options.concept, "compose": options.compose}
     plans = replace(plans, concepts=(goal,) * len(plans), provenance=provenance)
     plans.save(options.out)
