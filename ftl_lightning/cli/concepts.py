@@ -155,7 +155,8 @@ def sample(options: SampleOptions) -> None:
     with waiting("sampling"):
         starts = _sample_starts(options, model.domain)
         exported = _export_files(options.export, options.count if starts is None else len(starts))
-        plans = model.sample(composition, options.count if starts is None else None, starts, seed=options.seed, **_sampling(options))
+        count = options.count if starts is None else None
+        plans = model.sample(composition, count, starts, seed=options.seed, **_sampling(options))
     provenance = {**plans.provenance, "concept": options.concept, "compose": options.compose}
     plans = replace(plans, concepts=(goal,) * len(plans), provenance=provenance)
     plans.save(options.out)

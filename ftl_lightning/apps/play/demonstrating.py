@@ -1,6 +1,7 @@
 """Demonstrations of a concept collected on the page: by hand, from the library or from files."""
 
 import tempfile
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,22 +13,30 @@ from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.domains.domain import Source
 from ftl_lightning.domains.recorder import Recorder, Scene, check_path
 from ftl_lightning.few_shot.learner import FewShot
+from ftl_lightning.igm.composition import Composition
 from ftl_lightning.services.errors import UserError, require, short
 from ftl_lightning.training.checks import fit_findings
 
 WANTED = 5  # number of demonstrations that the page asks for
 MOST, MOST_SCENES, MOST_UNDONE = 50, 50, 50
 """Maximum number of demonstrations, of remembered scenes, and of changes that can be undone."""
+GENERATED = "The model itself generates these demonstrations, because no recordings come with it."
 FILES = (".npz", ".safetensors")  # suffixes of demonstration files, besides those of a domain's other programs
 
 
 class Demonstrating:
-    """Demonstrations of a concept for a model, and the scenes in which more can be recorded. ``source`` is the library, whose
-    recordings may be missing; ``task`` that of the last scene or demonstration drawn, or empty.
+    """Demonstrations of a concept for a model, and the scenes in which more can be recorded.
+
+    Attributes:
+        task: task of the last scene or demonstration drawn, or empty.
+
+    Args:
+        source: expert or recordings of the library.
+        concepts: concepts of the model by name, whose samples replace recordings that are missing.
     """
 
-    def __init__(self, model: FewShot, source: Source) -> None:
-        self._model, self._domain, self._source = model, model.domain, source
+    def __init__(self, model: FewShot, source: Source, concepts: Mapping[str, Composition]) -> None:
+        self._model, self._domain, self._source, self._concepts = model, model.domain, source, concepts
         self._entries: dict[int, Demonstrations] = {}
         self._before: list[dict[int, Demonstrations]] = []
         self._scenes: dict[int, Scene] = {}
@@ -42,15 +51,15 @@ class Demonstrating:
 
     @property
     def library(self) -> Json:
-        """Tasks whose demonstrations can be drawn, or the reason why there are none."""
+        """Tasks whose demonstrations can be drawn, and a remark if the model generates them."""
         if self._library is None:
             concepts = self._domain.concepts
             known = dict.fromkeys((*concepts.training, *(goal for suite in concepts.suites.values() for goal in suite.goals)))
             try:
                 self._source.draw(next(iter(known)), 1, 0)
                 self._library = {"tasks": list(known), "why": ""}
-            except UserError as error:
-                self._library = {"tasks": [], "why": f"This model comes without demonstrations to choose from: {error}"}
+            except UserError:  # no recordings
+                self._library = {"tasks": list(self._concepts), "why": GENERATED}
         return self._library
 
     @property
@@ -108,11 +117,19 @@ class Demonstrating:
         self.add(recorder.record(scene, *check_path(scene, request.path, request.seconds)))
 
     def draw(self, request: requests.Drawn) -> None:
-        """Add demonstrations of a task from the domain's expert or recordings. Raise UserError for a task without any."""
+        """Add demonstrations of a task from the expert, the recordings or the model. Raise UserError for a task without any."""
         self._domain.check_goal(request.task, "task")
         self._count += 1
-        self.add(self._source.draw(request.task, request.count, self._count))
+        generated = self.library["why"] == GENERATED
+        self.add((self._generated if generated else self._source.draw)(request.task, request.count, self._count))
         self.task = request.task
+
+    def _generated(self, task: str, count: int, seed: int) -> Demonstrations:
+        """Samples of a concept of the model from new initial states."""
+        require(task in self._concepts, "task", "a concept of this model", short(task))
+        starts = self._domain.source(None).starts(task, count, seed) if self._domain.observed else None
+        plans = self._model.sample(self._concepts[task], count, starts, seed=seed)
+        return replace(plans, concepts=(task,) * len(plans))
 
     def read(self, name: str, content: bytes) -> None:
         """Add the demonstrations of a file, whose suffix determines the program; damaged files and other domains are refused."""

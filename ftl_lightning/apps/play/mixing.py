@@ -31,10 +31,10 @@ JOINED = " and "  # separator of the names of mixed concepts, for domains that r
 
 
 def sampling_of(model: FewShot, temperature: float | None = None) -> dict[str, Any]:
-    """Settings of interactive sampling: the tuned sampler with few steps, or a fast sampler in its place."""
+    """Settings of interactive sampling: the tuned sampler if it takes few steps, else a fast one."""
     tuned = model.tuned.sampling
-    steps = min(tuned.steps, STEPS) if tuned.sampler == "dpm_solver" else STEPS
-    return {"sampler": "dpm_solver", "steps": steps, "temperature": tuned.temperature if temperature is None else temperature}
+    sampler, steps = (tuned.sampler, tuned.steps) if tuned.steps <= STEPS else ("dpm_solver", STEPS)
+    return {"sampler": sampler, "steps": steps, "temperature": tuned.temperature if temperature is None else temperature}
 
 
 def starts_of(model: FewShot, tasks: Sequence[str], count: int, seed: int) -> tuple[str, InitialStates | None]:

@@ -290,3 +290,18 @@ def test_names_become_variables(name: str, variable: str) -> None:
     assert Learned("any", name).variable == variable
     assert variable.isidentifier()
     assert variable not in VARIABLES
+
+
+def test_without_recordings_the_model_generates_demonstrations() -> None:
+    space = Workspace("mocap")
+    library = space.state()["library"]
+    assert library["tasks"][:2] == ["arm circle", "jumping jacks"]
+    assert "walk" in library["tasks"]
+    assert "generates these demonstrations" in library["why"]
+    collected = space._demonstrating
+    collected.draw(requests.Drawn(task="jumping jacks", count=5))
+    assert len(collected.report()["demonstrations"]) == 5
+    again = collected.together("jumping jacks")
+    assert again.states.shape == (5, 32, 42)
+    with pytest.raises(UserError, match="task: expected a concept of this model, found squat"):
+        collected.draw(requests.Drawn(task="squat", count=1))
