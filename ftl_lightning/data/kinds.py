@@ -374,7 +374,8 @@ def _proposed(
         return Group(CATEGORY, first, size, (size,))
     rotations = [*_poses(first, free), *([Group(ROTATION, first, 9, (9,))] if free >= 9 else [])]
     for group in [*rotations, *([Group(QUATERNION, first, 4, _sign(paths, first))] if free >= 4 else [])]:
-        if _shows(group, paths, names):
+        without_unit = group.kind == POSE or not any(units[group.columns])  # a pose has positions
+        if without_unit and _shows(group, paths, names):
             place = f"{place}: column {short(names[first], 40)!r}"
             _require_valid(group, paths, place, advice="; mend it, or declare the columns linear (data.kinds, state_kinds)")
             return group

@@ -270,6 +270,12 @@ def test_poses_lie_anywhere_in_a_state_and_samples_are_poses(capfd: pytest.Captu
         model.learn(states[:5].numpy(), steps=1)
 
 
+def test_columns_with_a_unit_are_no_rotations() -> None:
+    whole = quaternions(True)
+    assert kinds_of(whole, units=("",) * 4)[0].startswith("quaternion")
+    assert set(kinds_of(whole, units=("m",) * 4)) <= {"", "linear"}
+
+
 def test_matrices_that_do_not_turn_stay_linear() -> None:
     still = poses(4, False)
     still[..., [0, 1, 2, 4, 5, 6, 8, 9, 10]] = torch.eye(3).double().flatten()

@@ -49,20 +49,13 @@ def jerk(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
     return torch.linalg.vector_norm(third, dim=-1).mean(dim=(1, 2))
 
 
-CONTACT = 0.03  # Maximum height in metres of a standing foot's ankle above the level of the ground
-
-
 def skating(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
     """Metres a frame that the lower foot slides while it stands, of states with root ``(sample, frame, 46)``: ``(sample,)``.
 
-    The mean over steps between frames, after the first third of a second, in which this ankle is at most :data:`CONTACT` above the
-    ground; NaN if there are none.
+    The mean over steps between frames, after the first third of a second, in which the foot stands; NaN if there are none.
     """
-    ankles = skeleton.in_space(states)[:, SETTLED:, list(ANKLES)]
-    height = (ankles[:, 1:, :, 2] + ankles[:, :-1, :, 2]) / 2
-    slid = torch.linalg.vector_norm(torch.diff(ankles[..., :2], dim=1), dim=-1)
-    low, lower = height.min(dim=-1)
-    return slid.gather(-1, lower[..., None])[..., 0].masked_fill(low > CONTACT, torch.nan).nanmean(dim=1)
+    slid, low = (values[:, SETTLED:] for values in skeleton.sliding(states))
+    return torch.linalg.vector_norm(slid, dim=-1).masked_fill(low > skeleton.CONTACT, torch.nan).nanmean(dim=1)
 
 
 def _settled(states: Tensor) -> Tensor:

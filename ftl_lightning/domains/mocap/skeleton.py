@@ -92,6 +92,22 @@ def in_space(states: Tensor) -> Tensor:
     return torch.cat((_rotated(joints[..., :2], yaw[..., None]), joints[..., 2:]), dim=-1) + root[..., None, :]
 
 
+CONTACT = 0.03  # Maximum height in metres of a standing foot's ankle above the level at which ankles rest
+
+
+def sliding(states: Tensor) -> tuple[Tensor, Tensor]:
+    """Motion of the lower ankle over the ground between frames, of states with root ``(sample, frame, 46)``.
+
+    Returns:
+        Displacement to the right and forwards of the earlier frame, in metres ``(sample, frame - 1, 2)``, and the ankle's mean
+        height ``(sample, frame - 1)``.
+    """
+    ankles, yaw = in_space(states)[..., list(ANKLES), :], states[..., -1].cumsum(dim=1) - states[:, :1, -1]
+    low, lower = ((ankles[:, 1:, :, 2] + ankles[:, :-1, :, 2]) / 2).min(dim=-1)
+    moved = torch.diff(ankles[..., :2], dim=1).gather(2, lower[..., None, None].expand(-1, -1, -1, 2))[:, :, 0]
+    return _rotated(moved, -yaw[:, :-1, None]), low
+
+
 def _rotated(points: Tensor, yaw: Tensor) -> Tensor:
     """Points ``(..., 2)`` rotated to the left by angles ``(..., 1)`` in radians."""
     x, y = points[..., :1], points[..., 1:]
