@@ -9,7 +9,10 @@ in which a foot stands, in metres a frame; *still* is the share of samples below
 
 import argparse
 import json
+from collections.abc import Mapping
 from pathlib import Path
+from statistics import mean, stdev
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -43,6 +46,20 @@ def recorded(model: FewShot, root: Path) -> dict[str, float]:
     return numbers(model, "walk", torch.stack(windows), None) | {"windows": len(windows)}
 
 
+def table(results: Mapping[str, Any]) -> str:
+    """Markdown: mean over seeds and, in brackets, their spread."""
+    lines = ["| motion | rule | judge | sliding, cm a frame | still | jerk |", "|---|---|---|---|---|---|"]
+    for text, found in results.items():
+        rows = found.get("seeds", [found])
+        cells = [text]
+        for name, scale, digits in (("rule", 1, 2), ("accuracy", 1, 2), ("skating", 100, 2), ("still", 1, 2), ("jerk", 1, 0)):
+            values = [scale * row[name] for row in rows if name in row]
+            spread = f" ({stdev(values):.{digits}f})" if len(values) > 1 else ""
+            cells.append(f"{mean(values):.{digits}f}{spread}" if values else "-")
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
 def main() -> None:
     """See the module."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -54,9 +71,8 @@ def main() -> None:
     chosen = parser.parse_args()
     model = FewShot.from_pretrained(chosen.pretrained, settings="conf/mocap_root.yaml")
     source = model.domain.source(chosen.root)
-    results: dict[str, object] = {"model": model.model.hash, "samples": chosen.samples}
     kinematic = {name: value for name, value in recorded(model, chosen.root).items() if name not in ("accuracy", "rule")}
-    results["recordings"] = kinematic
+    results: dict[str, Any] = {"recordings": kinematic}
     concepts = (*TEST_CONCEPTS, *VALIDATION_CONCEPTS)
     with bar("human motion with root", len(SHOWN) + len(concepts) * len(chosen.seeds), lines=True) as advance:
         for text in SHOWN:
@@ -71,8 +87,9 @@ def main() -> None:
                 rows.append(numbers(model, text, model.sample(learned, None, starts, seed=seed).states, starts))
                 advance()
             results[text] = {"seeds": rows}
-            write_text(chosen.out, json.dumps(results, indent=1) + "\n")
-    print(json.dumps(results, indent=1))
+    content = {"model": model.model.hash, "samples": chosen.samples, "motions": results}
+    write_text(chosen.out, json.dumps(content, indent=1) + "\n")
+    write_text(chosen.out.with_suffix(".md"), table(results))
 
 
 if __name__ == "__main__":

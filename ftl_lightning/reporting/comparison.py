@@ -214,7 +214,7 @@ def short_overview(results: pd.DataFrame) -> Table:
     caption = (
         f"New concepts, mean ± standard error over tasks{brackets}. {OURS} (ours): in the paper's form "
         "(parametrisation) unless another is named; networks, representations, most losses and some guidance weights are not the "
-        "paper's. Lead: its form (default: the paper's) less the best pretrained baseline; 95 % interval over tasks"
+        "paper's. Lead: the paper's or the named form minus the best pretrained baseline; 95 % interval over tasks"
     )
     head = ["domain: setting, metric", OURS, "best pretrained baseline", "best without pretraining; oracle", "lead"]
     return make_table(None, "overview", caption, lines, head)
