@@ -2,14 +2,15 @@
 
     python benchmarks/experiments/mocap_root.py --root FOLDER [--pretrained mocap_root] [--out results/mocap_root.json]
 
-New concepts are learned from five recordings with an adapter, for each seed, and sampled from new initial poses, as in the tables
-of human motion; training concepts are sampled once. ``recordings`` are windows of held-out trials. Sliding is the mean over samples
-in which a foot stands, in metres a frame; *still* is the share of samples below :data:`STILL`.
+New concepts are learned from five recordings, with an adapter and as embeddings alone, for each seed, and sampled from new initial
+poses, as in the tables of human motion; training concepts are sampled once. ``recordings`` are windows of held-out trials. Sliding
+is the mean over samples in which a foot stands, in metres a frame; *still* is the share of samples below :data:`STILL`.
 """
 
 import argparse
 import json
 from collections.abc import Mapping
+from itertools import product
 from pathlib import Path
 from statistics import mean, stdev
 from typing import Any
@@ -26,6 +27,10 @@ from ftl_lightning.services.tensor_file import write_text
 
 STILL = 0.02  # Metres a frame
 DEMONSTRATIONS, SHOWN = 5, ("walk", "run", "jump")
+FORMS: dict[str, dict[str, Any]] = {
+    "with an adapter": {},
+    "embeddings alone": {"adapter": 0, "guidance_scale": 1.5, "steps": 100},  # as in conf/mocap.yaml
+}
 METRICS = ("accuracy", "rule", "jerk")
 
 
@@ -74,19 +79,19 @@ def main() -> None:
     kinematic = {name: value for name, value in recorded(model, chosen.root).items() if name not in ("accuracy", "rule")}
     results: dict[str, Any] = {"recordings": kinematic}
     concepts = (*TEST_CONCEPTS, *VALIDATION_CONCEPTS)
-    with bar("human motion with root", len(SHOWN) + len(concepts) * len(chosen.seeds), lines=True) as advance:
+    with bar("human motion with root", len(SHOWN) + len(FORMS) * len(concepts) * len(chosen.seeds), lines=True) as advance:
         for text in SHOWN:
             starts = source.starts(text, chosen.samples, 0)
             results[text] = numbers(model, text, model.sample(model[text], None, starts).states, starts)
             advance()
-        for text in concepts:
+        for (form, settings), text in product(FORMS.items(), concepts):
             rows = []
             for seed in chosen.seeds:
-                learned = model.learn(source.draw(text, DEMONSTRATIONS, seed), name=text, seed=seed)
+                learned = model.learn(source.draw(text, DEMONSTRATIONS, seed), name=text, seed=seed, **settings)
                 starts = source.starts(text, chosen.samples, seed)
                 rows.append(numbers(model, text, model.sample(learned, None, starts, seed=seed).states, starts))
                 advance()
-            results[text] = {"seeds": rows}
+            results[f"{text}, {form}"] = {"seeds": rows}
     content = {"model": model.model.hash, "samples": chosen.samples, "motions": results}
     write_text(chosen.out, json.dumps(content, indent=1) + "\n")
     write_text(chosen.out.with_suffix(".md"), table(results))

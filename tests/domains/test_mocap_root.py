@@ -9,7 +9,7 @@ import torch
 
 from ftl_lightning.domains.mocap import ROOTED, skeleton
 from ftl_lightning.domains.mocap.bvh import bvh
-from ftl_lightning.domains.mocap.domain import begun_elsewhere
+from ftl_lightning.domains.mocap.domain import SLIDING, begun_elsewhere, planted
 from ftl_lightning.domains.mocap.measures import SETTLED, skating
 from ftl_lightning.domains.mocap.prepare import demonstrated_with_root
 from ftl_lightning.domains.mocap.rendering import SOLE, wireframe
@@ -19,11 +19,11 @@ from tests.domains.mocap_samples import folder, motion
 ROOT = slice(len(COLUMNS), None)
 
 
-def walk_in_space(frames: int, turn: float) -> torch.Tensor:
-    """Joints ``(frame, 14, 3)`` of a rigid body that moves 3 cm a frame forwards and turns, from a place that is not the origin."""
+def walk_in_space(frames: int, turn: float, pace: float = 0.03) -> torch.Tensor:
+    """Joints ``(frame, 14, 3)`` of a rigid body that moves forwards and turns, from a place that is not the origin."""
     (pose,) = skeleton.standing_poses(1, torch.Generator().manual_seed(0)).reshape(1, 14, 3)
     yaw = 0.7 + turn * torch.arange(frames)
-    steps = 0.03 * torch.stack((-yaw.sin(), yaw.cos()), dim=-1)
+    steps = pace * torch.stack((-yaw.sin(), yaw.cos()), dim=-1)
     path = torch.tensor((2.0, -1.0)) + torch.cat((torch.zeros(1, 2), steps[:-1].cumsum(dim=0)))
     x, y = pose[:, 0], pose[:, 1]
     turned = torch.stack((yaw.cos()[:, None] * x - yaw.sin()[:, None] * y, yaw.sin()[:, None] * x + yaw.cos()[:, None] * y), dim=-1)
@@ -70,9 +70,18 @@ def test_a_window_begun_in_another_pose_stands_there_on_the_ground() -> None:
 
 @pytest.mark.parametrize("name", sorted(ROOTED.plans.views))
 def test_views_keep_the_root(name: str) -> None:
-    states = torch.from_numpy(normalised(walk_in_space(HORIZON, turn=0.05).double().numpy()).rooted)[None]
+    states = torch.from_numpy(normalised(walk_in_space(HORIZON, turn=0.01, pace=0.01).double().numpy()).rooted)[None]
     view, observed = ROOTED.plans.views[name], {POSE: states[:, 0, : len(COLUMNS)]}
     assert torch.allclose(view.decode(view.encode(states, observed), observed), states, atol=1e-4)
+
+
+def test_standing_feet_of_samples_hardly_slide_and_feet_in_the_air_are_left_alone() -> None:
+    states = torch.from_numpy(normalised(walk_in_space(HORIZON, turn=0.03).double().numpy()).rooted)[None]
+    moved = planted(states, {})
+    assert skating("walk", moved, None).item() == pytest.approx(SLIDING, abs=1e-5)
+    assert torch.equal(moved[..., : len(COLUMNS)], states[..., : len(COLUMNS)])
+    states[..., 44] += 0.1
+    assert torch.equal(planted(states, {}), states)
 
 
 def test_feet_slide_by_as_much_as_the_body_and_feet_in_the_air_do_not() -> None:
