@@ -134,8 +134,9 @@ def compared(rows: Sequence[Mapping[str, Any]], name: str, base: str) -> dict[st
     return {**means, "worse": worse}
 
 
-def measure(domain: str, root: Path | None, seeds: Sequence[int], rows: list[dict[str, Any]], out: Path) -> dict[str, float]:
-    """Add rows that are missing; return seconds by sampler."""
+def measure(domain: str, root: Path | None, seeds: Sequence[int], content: dict[str, Any], out: Path) -> dict[str, float]:
+    """Add rows that are missing to ``content``, and write it; return seconds by sampler."""
+    rows = content["rows"]
     model = FewShot.from_pretrained(domain)
     kinds = samplers(TEMPERATURES.get(domain, model.tuned.sampling.temperature))
     few = load(settings_of(domain), "invert")["data"]["init_args"].get("demonstrations_per_concept", 5)
@@ -160,7 +161,7 @@ def measure(domain: str, root: Path | None, seeds: Sequence[int], rows: list[dic
                 for name, sampling in kinds.items() if missing else ():
                     if (goal, name) not in known:
                         rows.append({"domain": domain, "task": goal, "seed": seed, "sampler": name, **judged.measured(sampling)})
-                        write_text(out, json.dumps({"rows": rows}, indent=1) + "\n")
+                        write_text(out, json.dumps(content, indent=1) + "\n")
                     advance()
     assert timed is not None
     calls: dict[str, list[float]] = {name: [] for name in kinds}
@@ -196,10 +197,10 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("results/samplers.json"))
     options = parser.parse_args()
     torch.set_num_threads(1)
-    content = json.loads(options.out.read_text()) if options.out.is_file() else {}
-    rows, table = content.get("rows", []), content.get("table", {})
+    content: dict[str, Any] = {"table": {}, "rows": []} | (json.loads(options.out.read_text()) if options.out.is_file() else {})
+    rows, table = content["rows"], content["table"]
     for domain in options.domains:
-        seconds = measure(domain, options.root if domain == "mocap" else None, options.seeds, rows, options.out)
+        seconds = measure(domain, options.root if domain == "mocap" else None, options.seeds, content, options.out)
         own = [row for row in rows if row["domain"] == domain]
         base = next(iter(seconds))
         shipped = FewShot.from_pretrained(domain).tuned.sampling
@@ -212,7 +213,7 @@ def main() -> None:
             }
             for name in seconds
         }
-        write_text(options.out, json.dumps({"table": table, "rows": rows}, indent=1) + "\n")
+        write_text(options.out, json.dumps(content, indent=1) + "\n")
     print(shown := markdown(table))
     write_text(options.out.with_suffix(".md"), shown)
 
