@@ -80,7 +80,7 @@ def own(columns: int, horizon: int) -> Callable[[], object]:
     np.savez(folder / "walks.npz", states=walks, concepts=np.repeat(("left", "right"), 10))
 
     def work() -> None:
-        data = OwnData(str(folder / "walks.npz"), metrics={}, check=False, encoder="hashing", batch_size=32)
+        data = OwnData(str(folder / "walks.npz"), metrics={}, check=False, encoder="hashing", batch_size=32, horizon=horizon)
         network = {"hidden_dim": 256, "depth": 4, "condition_dim": 384}
         module = PretrainingModule(denoiser_args=network, prediction="cosines", output=str(folder / "model"))
         quiet = {"logger": False, "enable_progress_bar": False, "enable_checkpointing": False}
@@ -118,7 +118,8 @@ def in_process(name: str, value: int) -> dict[str, Any]:
     command = [sys.executable, __file__, "--measure", name, str(value)]
     done = subprocess.run(command, capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"}, check=False)
     if done.returncode:
-        return {"value": value, "refused": (done.stderr.strip().splitlines() or ["killed"])[-1][:200]}
+        error = (done.stderr.strip().splitlines() or ["killed"])[-1]
+        return {"value": value, "refused": error.rpartition("UserError: ")[2][:200]}
     return {"value": value, **json.loads(done.stdout.splitlines()[-1])}
 
 
