@@ -162,7 +162,7 @@ class Workspace:
         """Name and bytes of an ``.npz`` of the current demonstrations, or of a concept's. Raise UserError if there are none."""
         if not key:
             return "demonstrations.npz", as_npz(self._demonstrating.together(""))
-        _, learned, demonstrations = self._shipped(key)
+        _, learned, demonstrations = self._learned_here(key)
         return learned.demonstrations, as_npz(demonstrations)
 
     # Concepts.
@@ -177,7 +177,7 @@ class Workspace:
         require(known.kind in ("learned", "opened"), "id", "a concept that was learned or opened here", "one of the model's")
         return known
 
-    def _shipped(self, key: str) -> tuple[Known, Learned, Demonstrations]:
+    def _learned_here(self, key: str) -> tuple[Known, Learned, Demonstrations]:
         """Concept that was learned here, how, and from what."""
         known = self._known(key)
         if known.demonstrations is None or known.learned is None:
@@ -265,10 +265,10 @@ class Workspace:
         """Learn a concept in the form that its demonstrations select. It replaces the former concept unless this has the same form,
         or more right samples.
         """
-        (_, _, demonstrations), begin = self._shipped(key), monotonic()
+        (_, _, demonstrations), begin = self._learned_here(key), monotonic()
         changes, steps = self._settings(False)
         concept = self._invert(demonstrations, changes, steps, lambda: stopped() or key not in self._concepts)
-        before, former, _ = self._shipped(key)  # it may have been renamed meanwhile
+        before, former, _ = self._learned_here(key)  # it may have been renamed meanwhile
         content = replace(concept.concept, origin=replace(concept.concept.origin, name=before.name))
         learned = replace(former, changes=changes, steps=self._changed(steps))
         known, found = self._measured(replace(before, composition=concept, concept=content, learned=learned), concept)

@@ -4,6 +4,7 @@ In every frame the middle of the hips is the origin, z is up, +y is where the hi
 also have its path, see :data:`ROOT`.
 """
 
+import itertools
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -84,10 +85,8 @@ def in_space(states: Tensor) -> Tensor:
     faces +y, the ground is z = 0.
     """
     right, forward, height, turn = (column[..., None] for column in states[..., len(COLUMNS) :].unbind(dim=-1))
-    steps = torch.cat((right, forward), dim=-1)[..., 1:, :]
-    yaw = torch.cat((torch.zeros_like(turn[..., :1, :]), turn[..., 1:, :].cumsum(dim=-2)), dim=-2)
-    path = _rotated(steps, yaw[..., :-1, :]).cumsum(dim=-2)
-    root = torch.cat((torch.nn.functional.pad(path, (0, 0, 1, 0)), height), dim=-1)
+    steps, yaw = torch.cat((right, forward), dim=-1)[..., 1:, :], _summed(turn[..., 1:, :])
+    root = torch.cat((_summed(_rotated(steps, yaw[..., :-1, :])), height), dim=-1)
     joints = as_joints(states)
     return torch.cat((_rotated(joints[..., :2], yaw[..., None]), joints[..., 2:]), dim=-1) + root[..., None, :]
 
@@ -102,10 +101,16 @@ def sliding(states: Tensor) -> tuple[Tensor, Tensor]:
         Displacement to the right and forwards of the earlier frame, in metres ``(sample, frame - 1, 2)``, and the ankle's mean
         height ``(sample, frame - 1)``.
     """
-    ankles, yaw = in_space(states)[..., list(ANKLES), :], states[..., -1].cumsum(dim=1) - states[:, :1, -1]
+    ankles, yaw = in_space(states)[..., list(ANKLES), :], _summed(states[:, 1:, -1:])
     low, lower = ((ankles[:, 1:, :, 2] + ankles[:, :-1, :, 2]) / 2).min(dim=-1)
     moved = torch.diff(ankles[..., :2], dim=1).gather(2, lower[..., None, None].expand(-1, -1, -1, 2))[:, :, 0]
-    return _rotated(moved, -yaw[:, :-1, None]), low
+    return _rotated(moved, -yaw[:, :-1]), low
+
+
+def _summed(steps: Tensor) -> Tensor:
+    """Sums ``(..., frame + 1, n)`` of steps ``(..., frame, n)`` from 0; not ``cumsum``, which is not deterministic on GPUs."""
+    zero = torch.zeros_like(steps[..., 0, :])
+    return torch.stack(list(itertools.accumulate(steps.unbind(dim=-2), initial=zero)), dim=-2)
 
 
 def _rotated(points: Tensor, yaw: Tensor) -> Tensor:
