@@ -32,7 +32,7 @@ class Demonstrating:
 
     Args:
         source: expert or recordings of the library.
-        concepts: concepts of the model by name, whose samples replace recordings that are missing.
+        concepts: concepts of the model by name, whose samples replace recordings that are missing; empty for none.
     """
 
     def __init__(self, model: FewShot, source: Source, concepts: Mapping[str, Composition]) -> None:
@@ -51,15 +51,16 @@ class Demonstrating:
 
     @property
     def library(self) -> Json:
-        """Tasks whose demonstrations can be drawn, and a remark if the model generates them."""
+        """Tasks whose demonstrations can be drawn; ``why`` they are generated, or the reason why there are none."""
         if self._library is None:
             concepts = self._domain.concepts
             known = dict.fromkeys((*concepts.training, *(goal for suite in concepts.suites.values() for goal in suite.goals)))
             try:
                 self._source.draw(next(iter(known)), 1, 0)
                 self._library = {"tasks": list(known), "why": ""}
-            except UserError:  # no recordings
-                self._library = {"tasks": list(self._concepts), "why": GENERATED}
+            except UserError as error:
+                why = GENERATED if self._concepts else f"This model comes without demonstrations to choose from: {error}"
+                self._library = {"tasks": list(self._concepts), "why": why}
         return self._library
 
     @property

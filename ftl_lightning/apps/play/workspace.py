@@ -111,8 +111,8 @@ class Workspace:
             self._concepts[f"s{number}"] = known
         shipped = {known.concept.origin.name: known.composition for known in self._concepts.values() if known.concept}
         trained = {known.name: known.composition for known in self._concepts.values() if not known.concept}
-        concepts = shipped | trained
-        self._demonstrating = Demonstrating(self._model, self._domain.source(root), concepts)
+        replacing = shipped | trained if root is None else {}  # a folder that cannot be read is reported
+        self._demonstrating = Demonstrating(self._model, self._domain.source(root), replacing)
 
     def state(self) -> dict[str, Any]:
         """Initial state of the page."""

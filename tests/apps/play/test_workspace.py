@@ -305,3 +305,9 @@ def test_without_recordings_the_model_generates_demonstrations() -> None:
     assert again.states.shape == (5, 32, 42)
     with pytest.raises(UserError, match="task: expected a concept of this model, found squat"):
         collected.draw(requests.Drawn(task="squat", count=1))
+
+
+def test_a_folder_of_recordings_that_cannot_be_read_is_reported(tmp_path: Path) -> None:
+    library = Workspace("mocap", tmp_path).state()["library"]
+    assert library["tasks"] == []
+    assert "expected recordings.npz, found an empty folder" in library["why"]
