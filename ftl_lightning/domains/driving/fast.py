@@ -94,8 +94,8 @@ class FastNetwork(RoadNetwork):
         if likely is not None:
             # Most lanes are farther than the previous lane. Ties go to the first lane.
             best = math.nextafter(self.get_lane(likely).nearer(x, y, heading, math.inf), math.inf)
-            off_x, off_y, reach = self._circles[0] - x, self._circles[1] - y, self._circles[2] + best
-            lanes = [lanes[number] for number in (off_x * off_x + off_y * off_y <= reach * reach).nonzero()[0].tolist()]
+            circles = zip(lanes, self._circles, strict=True)
+            lanes = [known for known, (at_x, at_y, radius) in circles if math.hypot(at_x - x, at_y - y) <= radius + best]
         for index, lane in lanes:
             if (distance := lane.nearer(x, y, heading, best)) is not None:
                 best, nearest = distance, index
@@ -109,6 +109,22 @@ def _updated(vehicle: Any) -> bool:
         vehicle.lane_index = network.get_closest_lane_index(vehicle.position, vehicle.heading, vehicle.lane_index)
         vehicle.lane = network.get_lane(vehicle.lane_index)
     return fast
+
+
+def _move(vehicle: Any, dt: float) -> None:
+    """``Vehicle.step`` of highway-env."""
+    vehicle.clip_actions()
+    beta = math.atan(math.tan(vehicle.action["steering"]) / 2)
+    x, y = vehicle.position.tolist()
+    course = vehicle.heading + beta
+    vehicle.position = np.array((x + vehicle.speed * math.cos(course) * dt, y + vehicle.speed * math.sin(course) * dt))
+    if vehicle.impact is not None:
+        vehicle.position += vehicle.impact
+        vehicle.crashed = True
+        vehicle.impact = None
+    vehicle.heading += vehicle.speed * math.sin(beta) / (vehicle.LENGTH / 2) * dt
+    vehicle.speed += vehicle.action["acceleration"] * dt
+    vehicle.on_state_update()
 
 
 class FastVehicle(IDMVehicle):
@@ -164,36 +180,68 @@ class FastVehicle(IDMVehicle):
 
     def step(self, dt: float) -> None:
         self.timer += dt
-        self.clip_actions()
-        beta = math.atan(math.tan(self.action["steering"]) / 2)
-        x, y = self.position.tolist()
-        self.position = np.array(
-            (x + self.speed * math.cos(self.heading + beta) * dt, y + self.speed * math.sin(self.heading + beta) * dt)
-        )
-        if self.impact is not None:
-            self.position += self.impact
-            self.crashed = True
-            self.impact = None
-        self.heading += self.speed * math.sin(beta) / (self.LENGTH / 2) * dt
-        self.speed += self.action["acceleration"] * dt
+        _move(self, dt)
+
+    def on_state_update(self) -> None:
         if not _updated(self):
-            self.on_state_update()
+            super().on_state_update()
 
 
 class FastController(MDPVehicle):
     """Controlled vehicle."""
+
+    steering_control = FastVehicle.steering_control
+
+    def step(self, dt: float) -> None:
+        _move(self, dt)
 
     def on_state_update(self) -> None:
         if self.road.record_history or not _updated(self):
             super().on_state_update()
 
 
+SLACK = 1e-6
+"""Metres that distances of vehicles may be wrong by, through rounding."""
+
+
+def _apart(one: Any, other: Any, dt: float) -> bool:
+    """Whether two rectangles do not touch during a step, as a side of one separates them: the test of ``RoadObject._is_colliding``.
+
+    False within :data:`SLACK` of touching.
+    """
+    x, y = (other.position - one.position).tolist()
+    cos, sin, there_cos, there_sin = math.cos(one.heading), math.sin(one.heading), math.cos(other.heading), math.sin(other.heading)
+    move_x = (one.speed * cos - other.speed * there_cos) * dt
+    move_y = (one.speed * sin - other.speed * there_sin) * dt
+    along, across = abs(cos * there_cos + sin * there_sin) / 2, abs(cos * there_sin - sin * there_cos) / 2
+    length, width, there_length, there_width = one.LENGTH, one.WIDTH, other.LENGTH, other.WIDTH
+    for axis_x, axis_y, reach in (
+        (cos, sin, length / 2 + there_length * along + there_width * across),
+        (-sin, cos, width / 2 + there_length * across + there_width * along),
+        (there_cos, there_sin, there_length / 2 + length * along + width * across),
+        (-there_sin, there_cos, there_width / 2 + length * across + width * along),
+    ):
+        gap, moved = x * axis_x + y * axis_y, move_x * axis_x + move_y * axis_y
+        if gap - max(moved, 0.0) > reach + SLACK or gap - min(moved, 0.0) < -reach - SLACK:
+            return True
+    return False
+
+
 class FastRoad(Road):
-    """Road that caches the vehicles per lane and checks only near pairs for collisions."""
+    """Road that caches the vehicles per lane and checks only near pairs for collisions.
+
+    Attributes:
+        until_crash: a vehicle after whose crash nothing moves, for look-ahead; ``None`` for no such vehicle.
+    """
+
+    until_crash: Any = None
 
     def act(self) -> None:
+        if self.until_crash is not None and self.until_crash.crashed:
+            return
         # Vehicles do not move while deciding.
         self._on_lane: dict[LaneIndex, list[tuple[float, RoadObject]]] | None = {}
+        self._places = [(v, *v.position.tolist()) for v in self.vehicles + self.objects if not isinstance(v, Landmark)]
         super().act()
         self._on_lane = None
 
@@ -218,28 +266,24 @@ class FastRoad(Road):
         return v_front, v_rear
 
     def _along(self, lane: Any) -> list[tuple[float, RoadObject]]:
-        there = []
-        for v in self.vehicles + self.objects:
-            if not isinstance(v, Landmark):
-                s, r = lane.local_coordinates(v.position)
-                if abs(r) <= lane.width / 2 + 1 and -lane.VEHICLE_LENGTH <= s < lane.length + lane.VEHICLE_LENGTH:
-                    there.append((s, v))
+        there, width, first, last = [], lane.width / 2 + 1, -lane.VEHICLE_LENGTH, lane.length + lane.VEHICLE_LENGTH
+        for v, x, y in self._places:
+            s, r = lane._local(x, y)
+            if abs(r) <= width and first <= s < last:
+                there.append((s, v))
         return there
 
     def step(self, dt: float) -> None:
+        if self.until_crash is not None and self.until_crash.crashed:
+            return
         for vehicle in self.vehicles:
             vehicle.step(dt)
-        places = [vehicle.position.tolist() for vehicle in self.vehicles]
-        sizes = [float(vehicle.diagonal) for vehicle in self.vehicles]
-        things = [(thing, thing.position.tolist(), float(thing.diagonal)) for thing in self.objects]
-        for i, (vehicle, (x, y), size) in enumerate(zip(self.vehicles, places, sizes, strict=True)):
+        things = [(thing, thing.position.tolist(), float(thing.diagonal)) for thing in self.vehicles + self.objects]
+        for i, (vehicle, (x, y), size) in enumerate(things[: len(self.vehicles)]):
             # As in RoadObject._is_colliding, with a margin for rounding: farther pairs cannot collide.
-            reach = size / 2 + vehicle.speed * dt + 1e-6
-            for j in range(i + 1, len(places)):
-                if math.hypot(places[j][0] - x, places[j][1] - y) <= reach + sizes[j] / 2:
-                    vehicle.handle_collisions(self.vehicles[j], dt)
-            for thing, (there_x, there_y), extent in things:
-                if math.hypot(there_x - x, there_y - y) <= reach + extent / 2:
+            reach = size / 2 + vehicle.speed * dt + SLACK
+            for thing, (there_x, there_y), extent in things[i + 1 :]:
+                if math.hypot(there_x - x, there_y - y) <= reach + extent / 2 and not _apart(vehicle, thing, dt):
                     vehicle.handle_collisions(thing, dt)
 
 
@@ -288,7 +332,7 @@ def accelerate(road: Road) -> None:
             lane._centre = tuple(map(float, lane.center))
         lane.__class__ = _LANES.get(type(lane), type(lane))
     network._lanes = list(network.lanes_dict().items())
-    network._circles = np.array([_circle(lane) for _, lane in network._lanes]).T
+    network._circles = [_circle(lane) for _, lane in network._lanes]
     network.__class__ = FastNetwork
     road.__class__ = _ROADS.get(type(road), type(road))
     for vehicle in road.vehicles:

@@ -116,7 +116,7 @@ class Worlds:
         """The simulation for a block, with :data:`FRAMES` in sampled worlds."""
         config = self._env.config
         sampled = FRAMES * config["policy_frequency"]
-        return imagined(self._env, sampled if self._foresight.beliefs else config["simulation_frequency"])
+        return imagined(self._env, sampled if self._foresight.beliefs else config["simulation_frequency"], until_crash=True)
 
     def state(self, decision: int) -> NDArray[np.float64] | None:
         """State ``(7,)`` after a decision in the first world without a crash; ``None`` if all crash."""

@@ -275,13 +275,18 @@ def restore(env: AbstractEnv, snapshot: Snapshot) -> None:
 
 
 @contextmanager
-def imagined(env: AbstractEnv, frequency: int) -> Iterator[Snapshot]:
-    """Simulate at a frequency in Hz within the block, from the yielded state, which is restored afterwards."""
+def imagined(env: AbstractEnv, frequency: int, until_crash: bool = False) -> Iterator[Snapshot]:
+    """Simulate at a frequency in Hz within the block, from the yielded state, which is restored afterwards.
+
+    With ``until_crash`` the simulation may stop when the controlled vehicle crashes.
+    """
     actual, usual = save(env), env.config["simulation_frequency"]
     env.config["simulation_frequency"] = frequency
+    env.road.until_crash = env.vehicle if until_crash else None
     try:
         yield actual
     finally:
+        env.road.until_crash = None
         env.config["simulation_frequency"] = usual
         restore(env, actual)
 
