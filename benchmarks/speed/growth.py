@@ -25,6 +25,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from matplotlib.figure import Figure
 
 from ftl_lightning.services.tensor_file import write_text
 
@@ -48,10 +49,10 @@ def shipped() -> Any:
     return FewShot.from_pretrained("strokes")
 
 
-def learned(count: int, **options: int) -> Callable[[], object]:
+def learned(count: int, steps: int = STEPS, **options: int) -> Callable[[], object]:
     """Learn one concept from ``count`` strokes."""
     model, states = shipped(), strokes(count)
-    return lambda: model.learn(list(states), steps=STEPS, form="paper", **options)
+    return lambda: model.learn(list(states), steps=steps, form="paper", **options)
 
 
 def together(count: int) -> Callable[[], object]:
@@ -91,6 +92,7 @@ def own(columns: int, horizon: int) -> Callable[[], object]:
 
 SERIES: dict[str, tuple[str, Callable[[int], Callable[[], object]], tuple[int, ...]]] = {
     "demonstrations": ("learn a concept", learned, (5, 50, 500, 5_000, 50_000)),
+    "steps": ("learn a concept", lambda value: learned(DEMONSTRATIONS, steps=value), (1, 10, 100, 1_000, 10_000)),
     "K": ("learn a concept", lambda value: learned(DEMONSTRATIONS, components=value), (1, 10, 100, 1_000)),
     "restarts": ("learn a concept", lambda value: learned(DEMONSTRATIONS, restarts=value), (1, 10, 100, 1_000)),
     "concepts": ("learn concepts together", together, (1, 10, 100, 1_000, 10_000)),
@@ -152,6 +154,19 @@ def table(series: dict[str, dict[str, Any]]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def figure(series: dict[str, dict[str, Any]]) -> Figure:
+    """Seconds and megabytes of all series over the value that varies, relative to its smallest."""
+    drawn = Figure(figsize=(9.5, 4.2), layout="constrained")
+    panels = drawn.subplots(1, 2)
+    for panel, key in zip(panels, ("seconds", "megabytes"), strict=True):
+        for name, found in series.items():
+            rows = found["rows"]
+            panel.loglog([row["value"] / rows[0]["value"] for row in rows], [row[key] for row in rows], "o-", label=name)
+        panel.set(xlabel="value, in multiples of the smallest", ylabel="processor seconds" if key == "seconds" else "MB added")
+    panels[0].legend()
+    return drawn
+
+
 def main() -> None:
     """See the module."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -182,7 +197,9 @@ def main() -> None:
             write_text(chosen.out, json.dumps(found, indent=1) + "\n")
         found[name] = {"rows": rows, "end": reason}
     write_text(chosen.out, json.dumps(found, indent=1) + "\n")
-    write_text(chosen.out.with_suffix(".md"), table({name: found[name] for name in SERIES if name in found}))
+    known = {name: found[name] for name in SERIES if name in found}
+    write_text(chosen.out.with_suffix(".md"), table(known))
+    figure(known).savefig(chosen.out.with_suffix(".png"), dpi=120)
 
 
 if __name__ == "__main__":

@@ -14,11 +14,15 @@ step; for sampling also with the concept's features computed once instead of for
 *Few steps*: DPM-Solver++ of both with the same number of steps. Equal noise gives equal plans with DDPM and DDIM, and learned
 concepts have equal losses on common noise; both are in the file. CleanDiffuser is not compared, as it has no release on PyPI.
 
+*With LoRA*: adapters of the same rank on the same weights, with the same loss; theirs by ``peft``, with a copy of the network and
+textual inversion for each concept.
+
 One thread; seconds are of processor time, medians of calls that alternate between the candidates, in both orders, with the smallest
 and the largest.
 """
 
 import argparse
+import copy
 import functools
 import importlib.metadata
 import json
@@ -34,6 +38,8 @@ from typing import Any, Literal, NamedTuple
 import torch
 from diffusers import DDIMScheduler, DDPMScheduler, DPMSolverMultistepScheduler
 from diffusers.optimization import get_scheduler
+from peft import LoraConfig, inject_adapter_in_model
+from peft.tuners.tuners_utils import BaseTunerLayer
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -54,6 +60,8 @@ Batching = Literal["one by one", "batched"]
 CONCEPTS, PLANS, DENOISING, K, GUIDANCE = 10, 50, 100, 2, 1.2
 LEARNING_RATE = 0.1
 """Of ours and of theirs."""
+RANK, RATE = 4, 1e-3
+"""Rank and learning rate of adapters."""
 FEW = 10
 """Steps of the few-step samplers."""
 SINGLES, SLICE = 3, 3
@@ -142,9 +150,15 @@ def their_plans(
 
 
 def their_concept(
-    model: GenerativeModel, demonstrations: Tensor, samples: int, steps: int, batching: Batching, draw: torch.Generator
+    model: GenerativeModel,
+    demonstrations: Tensor,
+    samples: int,
+    steps: int,
+    batching: Batching,
+    draw: torch.Generator,
+    rank: int = 0,
 ) -> Composition:
-    """Textual inversion of K new rows of the table of embeddings.
+    """Textual inversion of K new rows of the table of embeddings; with a rank, also LoRA in the conditional branches.
 
     Args:
         model: frozen.
@@ -153,14 +167,22 @@ def their_concept(
         steps: of the optimiser.
         batching: whether they are one batch or accumulated.
         draw: of start, demonstrations, noise and timesteps.
+        rank: of adapters of all linear layers; 0 for none.
     """
     network, scheduler = Conditional(model), ddpm_scheduler(model)
+    factors: list[nn.Parameter] = []
+    if rank:
+        network.network = copy.deepcopy(model.denoiser)
+        linear = [name for name, layer in network.network.named_modules() if isinstance(layer, nn.Linear)]
+        inject_adapter_in_model(LoraConfig(r=rank, lora_alpha=rank, target_modules=linear), network.network)
+        factors = [parameter for parameter in network.network.parameters() if parameter.requires_grad]
     known = torch.cat((model.empty[None], model.training_embeddings))
     start = 0.05 * torch.randn(K, known.shape[1], generator=draw)
     table = nn.Embedding.from_pretrained(torch.cat((known, start)), freeze=False)
     original = table.weight.detach().clone()
     kept = torch.arange(len(original)) < len(known)
-    optimiser = torch.optim.AdamW(table.parameters(), lr=LEARNING_RATE, weight_decay=0.0)
+    groups: list[dict[str, Any]] = [{"params": [*table.parameters()]}, *([{"params": factors, "lr": RATE}] if rank else [])]
+    optimiser = torch.optim.AdamW(groups, lr=LEARNING_RATE, weight_decay=0.0)
     rate = get_scheduler("cosine", optimizer=optimiser, num_warmup_steps=0, num_training_steps=steps)
     size = samples if batching == "batched" else 1
     for _ in range(steps):
@@ -170,7 +192,15 @@ def their_concept(
             t = torch.randint(scheduler.config["num_train_timesteps"], (size,), generator=draw)
             noisy = scheduler.add_noise(clean, noise, t)
             tokens = torch.tensor([0, *range(len(known), len(original))]).repeat_interleave(size)
-            estimates = network(torch.cat([noisy] * (1 + K)), t.repeat(1 + K), encoder_hidden_states=table(tokens)).sample
+            if rank:
+                adapt(network, False)
+                with torch.no_grad():
+                    unconditional = network(noisy, t, encoder_hidden_states=table(tokens[:size])).sample
+                adapt(network, True)
+                conditional = network(torch.cat([noisy] * K), t.repeat(K), encoder_hidden_states=table(tokens[size:])).sample
+                estimates = torch.cat((unconditional, conditional))
+            else:
+                estimates = network(torch.cat([noisy] * (1 + K)), t.repeat(1 + K), encoder_hidden_states=table(tokens)).sample
             loss = functional.mse_loss(guided(estimates, GUIDANCE), noise, reduction="mean")
             (loss * size / samples).backward()
         optimiser.step()
@@ -179,6 +209,13 @@ def their_concept(
         with torch.no_grad():
             table.weight[kept] = original[kept]
     return Composition(table.weight.detach()[-K:, None].clone(), torch.full((K,), GUIDANCE))
+
+
+def adapt(network: nn.Module, enabled: bool) -> None:
+    """Switch the adapters of ``peft`` on or off."""
+    for layer in network.modules():
+        if isinstance(layer, BaseTunerLayer):
+            layer.enable_adapters(enabled)
 
 
 @torch.no_grad()
@@ -297,12 +334,13 @@ def learning(work: Work) -> tuple[dict[str, Timed], dict[str, Any]]:
     normalised = [model.encode(own.states, {}) for own in work.concepts]
     every = concatenate(work.concepts)
 
-    def theirs(index: int, steps: int, batching: Batching) -> Composition:
-        return their_concept(model, normalised[index], samples, steps, batching, generator("cpu", 5, index))
+    def theirs(index: int, steps: int, batching: Batching, rank: int = 0) -> Composition:
+        return their_concept(model, normalised[index], samples, steps, batching, generator("cpu", 5, index), rank)
 
     def all_of_theirs() -> list[Composition]:
         return [theirs(index, work.steps, "batched") for index in range(len(normalised))]
 
+    adapted = work.settings.changed(adapter=RANK, adapter_learning_rate=RATE)
     own = invert(model, every, work.settings, work.steps)
     other = all_of_theirs()
     losses = {
@@ -315,6 +353,10 @@ def learning(work: Work) -> tuple[dict[str, Timed], dict[str, Any]]:
             "ours, one": lambda: invert(model, work.concepts[0], work.settings, work.steps),
             "theirs, batched, a concept after another": all_of_theirs,
             "theirs, batched, one": lambda: theirs(0, work.steps, "batched"),
+            "ours, with LoRA, together": lambda: invert(model, every, adapted, work.steps),
+            "theirs, with LoRA, a concept after another": lambda: [
+                theirs(index, work.steps, "batched", RANK) for index in range(len(normalised))
+            ],
         }
     )
     single = "theirs, as its examples do, one (scaled)"
@@ -326,6 +368,11 @@ def learning(work: Work) -> tuple[dict[str, Timed], dict[str, Any]]:
         "ours over theirs, largest": round(max(one / another for one, another in losses.values()), 4),
     }
     return seconds, losses_of
+
+
+def ours_like(name: str) -> str:
+    """Our measurement beside one of theirs."""
+    return "ours, with LoRA, together" if "LoRA" in name else "ours, one" if ", one" in name else "ours, together"
 
 
 def main() -> None:
@@ -350,7 +397,7 @@ def main() -> None:
             "capability": torch.backends.cpu.get_cpu_capability(),
             "threads": 1,
             "torch": torch.__version__,
-            "diffusers": importlib.metadata.version("diffusers"),
+            **{name: importlib.metadata.version(name) for name in ("diffusers", "peft")},
         },
         "work": {
             "concepts": len(names),
@@ -377,7 +424,7 @@ def main() -> None:
             if "theirs" in name
         },
         "learning": {
-            name: round(timed.median / inversion["ours, one" if ", one" in name else "ours, together"].median, 2)
+            name: round(timed.median / inversion[ours_like(name)].median, 2)
             for name, timed in inversion.items()
             if "theirs" in name
         },

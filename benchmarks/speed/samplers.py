@@ -3,7 +3,8 @@
     python benchmarks/speed/samplers.py [--domains object_rearrangement agent] [--seeds 0 1 2] [--root FOLDER]
 
 Concepts of each domain's validation suite are learned in the shipped form, for each seed. Every sampler generates plans of the
-suite's tasks, compositions with training concepts included, from the same new initial states. A sampler is *equal* if accuracy,
+suite's tasks, compositions with training concepts included, from the same new initial states; where the suite has fewer than three
+tasks, those of the training concepts too. A sampler is *equal* if accuracy,
 diversity and energy score are each at most one standard error worse than those of DDPM; standard errors are over tasks and seeds,
 of paired differences. Diversity is the mean distance between plans from the same state, and the energy score (less is better)
 that for fresh behaviour from this state. Where plans are executed, accuracy is that of episodes. Seconds are of processor time
@@ -45,6 +46,8 @@ TEMPERATURES = {"object_rearrangement": 0.1}
 """Temperature of all steps of DDPM where it is not the shipped one."""
 PLANS, FRESH, EACH, TIMED, REPEATS = 50, 20, 8, 500, 3
 """Plans whose accuracy is measured, fresh demonstrations, plans from each of their states, timed plans, and timed calls."""
+FEW = 3
+"""A suite with fewer tasks is too few for a standard error: the model's training concepts are judged too."""
 FRESH_SEED = 4000
 """Seed of fresh demonstrations, which no other part of the program uses."""
 
@@ -144,6 +147,8 @@ def measure(domain: str, root: Path | None, seeds: Sequence[int], content: dict[
     tasks = {
         task.goal: task for task in suite.tasks if task.initial == "new" and task.learned and not task.on and not task.component
     }
+    if len(tasks) < FEW:
+        tasks |= {text: EvaluationTask("training concept", text, texts=(text,)) for text in model.model.config.training_concepts}
     timed: Judged | None = None
     for seed in seeds:
         known = {(row["task"], row["sampler"]) for row in rows if row["domain"] == domain and row["seed"] == seed}

@@ -50,8 +50,9 @@ def peers(found: Mapping[str, Any]) -> str:
             seconds = f"{middle:.2f} ({least:.2f} to {most:.2f})"
             lines.append(cells(name, seconds, "" if ratio is None else f"{ratio:.1f}"))
     machine, work = found["machine"], found["work"]
-    where = f"{machine['capability']}, {threads(machine['threads'])}, diffusers {machine['diffusers']}; {work['concepts']} concepts"
+    where = f"{machine['capability']}, {threads(machine['threads'])}, diffusers {machine['diffusers']}, peft {machine['peft']}"
     where += (
+        f"; {work['concepts']} concepts"
         f", {work['plans of each']} plans of each, {work['denoising steps']} steps; {work['steps of learning']} steps of learning"
     )
     losses = found["loss of learned concepts"]

@@ -24,6 +24,7 @@ from ftl_lightning.services import log_folder, trust
 from ftl_lightning.services.command_line import Arguments
 from ftl_lightning.services.configuration import parts
 from ftl_lightning.services.errors import UserError, mistake_behind, require, short
+from ftl_lightning.services.store import modified
 from ftl_lightning.services.text import say
 from ftl_lightning.services.validation import check_range
 from ftl_lightning.training.board import TrainingBar, accuracies
@@ -129,9 +130,9 @@ class CommandLine(LightningCLI):
             return log_folder.claim(folder, name, new=self._verb == "invert")
         return name
 
-    def _model_folder(self) -> Path:
+    def _model_folder(self) -> str:
         """Folder of the model that ``fit`` writes."""
-        return Path(self.model.hparams.get("output") or Path(self.trainer.log_dir or self.trainer.default_root_dir) / "pretrained")
+        return str(self.model.hparams.get("output") or Path(self.trainer.log_dir or self.trainer.default_root_dir) / "pretrained")
 
     def after_fit(self) -> None:
         """Print the folder of the model."""
@@ -153,7 +154,7 @@ class CommandLine(LightningCLI):
         """Resolve ``last`` to the path of the last checkpoint; without any, the run starts from the beginning, with a note."""
         options = self.config_init[self._verb]
         warnings.filterwarnings("ignore", message="Checkpoint directory .* exists and is not empty")  # as is meant
-        if self._verb == "fit" and not options.get("ckpt_path") and (self._model_folder() / "config.json").exists():
+        if self._verb == "fit" and not options.get("ckpt_path") and modified(f"{self._model_folder()}/config.json"):
             say(f"note: {self._model_folder()}: is replaced", error=True)
         if options.get("ckpt_path") == "last":
             options["ckpt_path"] = last_checkpoint(self.trainer)

@@ -22,6 +22,7 @@ from ftl_lightning.services.files import (
     written_to,
 )
 from ftl_lightning.services.shipped import check_extra, missing_model, pretrained_folder, shipped
+from ftl_lightning.services.store import is_url, modified
 
 _LONG = {"-c": "--config", "-h": "--help"}
 
@@ -96,7 +97,9 @@ def _model(path: str, option: str) -> None:
 
 
 def _checkpoint(path: str, option: str) -> None:
-    if path != "last":
+    if is_url(path):
+        require(modified(path) is not None, option, "a checkpoint file", f"nothing at {path}")
+    elif path != "last":
         with about(option):
             check_readable(path, "checkpoint")
 
@@ -132,6 +135,11 @@ def _table(path: str, option: str) -> None:
     check_writable_file(path, option)
 
 
+def _written_model(path: str, option: str) -> None:
+    if not is_url(path):
+        check_writable_folder(path, option)
+
+
 def _results(path: str, option: str) -> None:
     """Check a results file that rows are added to."""
     check_writable_file(path, option)
@@ -143,7 +151,7 @@ TRAINER: Mapping[str, Check] = {
     "model.pretrained": _model,
     "data.demonstrations": _demonstrations,
     "ckpt_path": _checkpoint,
-    "model.output": check_writable_folder,
+    "model.output": _written_model,
     "evaluation.results": _results,
     "evaluation.films": check_writable_file,
 }

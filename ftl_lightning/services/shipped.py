@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from ftl_lightning.services.errors import UserError, short
+from ftl_lightning.services.store import fetched, is_url
 
 FOLDERS = ("conf", "pretrained")
 """Shipped folders."""
@@ -16,6 +17,8 @@ MODELS = _PACKAGE / "pretrained"
 """Folder of the shipped models."""
 TOPICS: Mapping[str, str] = {"motion": "mocap", "navigation": "agent", "rearrangement": "object_rearrangement"}
 """Shipped models by topic, where their domain has another name."""
+MODEL_FILES = ("model.safetensors", "demonstrations.safetensors", "config.json")
+"""Files of a model's folder, the configuration last; only models of a user's data have demonstrations."""
 FILM = Path(__file__).parent / "film.js"
 """Script that draws films on a page. It contains ``"use strict"``, so it must be the first script."""
 
@@ -60,7 +63,15 @@ def missing_model(place: str | Path) -> str:
 
 
 def pretrained_folder(name: str | Path) -> Path:
-    """Folder of a pretrained model by its path, shipped name or topic, such as ``agent`` or ``navigation``."""
+    """Folder of a pretrained model by its path, shipped name or topic, such as ``agent`` or ``navigation``.
+
+    The files of a URL, such as ``s3://bucket/model``, are copied to a temporary folder.
+
+    Raises:
+        UserError: if a store cannot be reached.
+    """
+    if is_url(name):
+        return fetched(str(name), MODEL_FILES)
     for path in (Path(name), shipped(name), shipped(Path("pretrained") / TOPICS.get(str(name), name))):
         if (path / "config.json").is_file():
             return path

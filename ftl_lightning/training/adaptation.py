@@ -19,8 +19,9 @@ from ftl_lightning.igm.concept import NEW_COMPONENT, Concept, Point, file_name
 from ftl_lightning.igm.library import concept_files, write_concept
 from ftl_lightning.igm.settings import InversionSettings
 from ftl_lightning.services import log_folder
-from ftl_lightning.services.errors import UserError, note
+from ftl_lightning.services.errors import UserError, note, require
 from ftl_lightning.services.modes import usual_modes
+from ftl_lightning.services.store import is_url
 from ftl_lightning.training.checks import longer_than_plans, notes_of
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.data import InversionData
@@ -62,6 +63,7 @@ class Adaptation(pl.LightningModule, ABC):
 
     def __init__(self, pretrained: str, omega: float, output: str | None) -> None:
         super().__init__()
+        require(output is None or not is_url(output), "model.output", "a folder on this machine", output)
         self.model: ConceptModel = load_model(pretrained)
         if not self.adapts(type(self.model)):
             expected = f"a model of kind {' or '.join(kinds_for(self.adapts)) or 'another'}"

@@ -19,6 +19,7 @@ from torch import Tensor
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.services.errors import UserError, require, short, shown
 from ftl_lightning.services.files import check_readable
+from ftl_lightning.services.store import fetched, is_url, modified
 from ftl_lightning.services.tensor_file import atomic, check_finite, visible
 
 SIGNATURE = "belongs_to"
@@ -48,7 +49,7 @@ class WholeCheckpoints(TorchCheckpointIO):
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
         """Write a checkpoint atomically; ``UserError`` if the folder cannot be written or the disk is full."""
-        if "://" in str(path):  # a store without renaming
+        if is_url(path):  # stores write whole files
             super().save_checkpoint(checkpoint, path, storage_options)
             return
         content = io.BytesIO()
@@ -60,8 +61,6 @@ class WholeCheckpoints(TorchCheckpointIO):
         self, path: str | Path, map_location: Callable[..., Any] | None = None, weights_only: bool | None = None
     ) -> dict[str, Any]:
         """Read a checkpoint to the CPU by :func:`read_checkpoint`; ``weights_only`` is always on."""
-        if "://" in str(path):
-            return super().load_checkpoint(path, map_location, weights_only=True)
         content = read_checkpoint(path)
         try:
             old = Version(content.get(_VERSION, "")) < Version("2")
@@ -73,11 +72,14 @@ class WholeCheckpoints(TorchCheckpointIO):
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
-    """Read a checkpoint and verify its checksums.
+    """Read a checkpoint, from a store if the path is a URL, and verify its checksums.
 
     Raises:
-        UserError: for a damaged or foreign file, with the newest whole checkpoint of the folder.
+        UserError: for a damaged or foreign file, with the newest whole checkpoint of a local folder.
     """
+    if is_url(path):
+        folder, _, name = str(path).rpartition("/")
+        return _read(fetched(folder, [name]) / name)
     try:
         return _read(Path(path))
     except UserError as error:
@@ -124,12 +126,17 @@ def _is_whole(path: Path) -> bool:
     return True
 
 
-def last_checkpoint(trainer: pl.Trainer) -> Path | None:
+def last_checkpoint(trainer: pl.Trainer) -> str | None:
     """The newest of the last checkpoints of the trainer's callbacks; ``None`` without any."""
     callbacks = [callback for callback in trainer.checkpoint_callbacks if isinstance(callback, ModelCheckpoint)]
     # No public name: Lightning finds last checkpoints only while it resumes, too late to say that there is none.
-    paths = [Path(path) for callback in callbacks for path in callback._find_last_checkpoints(trainer)]
-    return max((path for path in paths if path.is_file()), key=lambda path: path.stat().st_mtime, default=None)
+    paths = []
+    for callback in callbacks:
+        protocol, remote, _ = str(callback.dirpath).partition("://")  # Lightning leaves the protocol out
+        found = [str(path) for path in callback._find_last_checkpoints(trainer)]
+        paths += [f"{protocol}://{path.lstrip('/')}" for path in found] if remote else found
+    times = {path: modified(path) for path in paths}
+    return max((path for path in paths if times[path] is not None), key=lambda path: times[path] or 0.0, default=None)
 
 
 def check_parameters(parameters: Mapping[str, Any], module: pl.LightningModule) -> None:

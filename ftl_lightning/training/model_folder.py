@@ -1,6 +1,7 @@
 """Folder of a pretrained model: ``config.json``, ``model.safetensors``, and examples of a user's data."""
 
 import json
+import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -17,7 +18,8 @@ from ftl_lightning.domains.from_file import own_domain
 from ftl_lightning.domains.registry import domain_of_file, is_known, load_domain
 from ftl_lightning.services.errors import UserError, about, short
 from ftl_lightning.services.modes import usual_modes
-from ftl_lightning.services.shipped import pretrained_folder
+from ftl_lightning.services.shipped import MODEL_FILES, pretrained_folder
+from ftl_lightning.services.store import is_url, put
 from ftl_lightning.services.tensor_file import alone, check_finite, file_hash, load_tensors, save_tensors, write_text
 from ftl_lightning.services.validation import from_mapping
 from ftl_lightning.training.concept_model import KIND, ConceptModel
@@ -32,9 +34,17 @@ EXAMPLES = "demonstrations.safetensors"
 def save_model(model: ConceptModel, folder: str | Path) -> None:
     """Write ``config.json``, ``model.safetensors`` and any examples, each atomically; weights in half precision.
 
+    The folder may be in a store, such as ``s3://bucket/model``.
+
     Raises:
-        UserError: before writing, for weights that are not finite or too large for half precision.
+        UserError: before writing, for weights that are not finite or too large for half precision; for a store that cannot be
+            reached.
     """
+    if is_url(folder):
+        with tempfile.TemporaryDirectory() as local:
+            save_model(model, local)
+            put(Path(local), str(folder), [name for name in MODEL_FILES if (Path(local) / name).is_file()])
+        return
     folder, stored = Path(folder), model.stored()
     check_finite(stored, str(folder), "nothing was written; train it again")
     header = {"format": VERSION, "hash": model.hash, "kind": model.kind}
