@@ -19,10 +19,10 @@ NEW, PARTS, WHOLE = "new concept", "new + training, by parts of the body", "new 
 LAST, LAST_BOTH = "new concept, last states", "new + training, last states"
 MORE = "new concept, eight actions"
 METHODS = (
-    ("**over time with modes**", "FTL-IGM", "with modes over time", 1),
-    ("**the same with an adapter**", "FTL-IGM", "with modes over time with adapter", 1),
-    ("form chosen", "FTL-IGM", "over time form chosen", 1),
-    ("over time, one set", "FTL-IGM", "over time", 1),
+    ("**with modes, with knots**", "FTL-IGM", "with modes, with knots", 1),
+    ("**the same with an adapter**", "FTL-IGM", "with modes, with knots, with adapter", 1),
+    ("form chosen", "FTL-IGM", "with knots, form chosen", 1),
+    ("with knots, one set", "FTL-IGM", "with knots", 1),
     ("one set for the whole plan, K = 2", "FTL-IGM", "", 2),
     ("LoRA fine-tuning", "LoRA fine-tuning", "", 1),
     ("language", "language", "", 0),

@@ -1,7 +1,7 @@
 """Start-up cost of each verb: seconds, modules and the largest packages, measured on an idle machine.
 
     python benchmarks/speed/imports.py [--runs 5] [--out results/imports.json]
-    python benchmarks/speed/imports.py --page  # writes the table in docs/speed.md from that file
+    python benchmarks/speed/imports.py --page  # writes the table in results/imports.md from that file
 
 Each verb runs in a separate process several times after a warm-up run; numbers are medians. *Help* is the time of ``VERB --help``.
 *Start* is the time from the start of the process to the first step of learning, or to the end of verbs without learning. *Imports*
@@ -48,8 +48,6 @@ LARGEST, SHOWN = 10, 4
 """Packages that are told of each, in the file and on the page."""
 LEAST = 0.05
 """Seconds of a package that is told on the page."""
-PAGE = ROOT / "docs" / "speed.md"
-BEGIN, END = "<!-- imports: begin, written by benchmarks/speed/imports.py -->\n", "<!-- imports: end -->\n"
 PROGRAM = """
 import functools, os, sys, time
 
@@ -148,21 +146,15 @@ def _help(found: Mapping[str, Any], verb: str) -> str:
     return f"{found['help'][verb]:.1f} s" if verb in found["help"] else ""
 
 
-def written(page: str, found: Mapping[str, Any]) -> str:
-    """A page with the table between its marks."""
-    before, _, rest = page.partition(BEGIN)
-    _, _, after = rest.partition(END)
-    return f"{before}{BEGIN}{table(found)}{END}{after}"
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--runs", type=int, default=5, help="that count, of each measurement")
     parser.add_argument("--out", default="results/imports.json")
     parser.add_argument("--page", action="store_true", help="measure nothing, write the table")
     options = parser.parse_args()
+    out = Path(options.out)
     if options.page:
-        write_text(PAGE, written(PAGE.read_text("utf-8"), json.loads(Path(options.out).read_text("utf-8"))))
+        write_text(out.with_suffix(".md"), table(json.loads(out.read_text("utf-8"))))
         return
     found: dict[str, Any] = {
         "machine": {
@@ -179,7 +171,8 @@ def main() -> None:
         started(STARTS["generate"], folder)  # the file that others read
         found["start"] = {verb: start(arguments, folder, options.runs) for verb, arguments in STARTS.items()}
         found["help"] = {verb: shown(verb, folder, options.runs) for verb in (*TRAINER_VERBS, *COMMANDS)}
-    write_text(Path(options.out), json.dumps(found, indent=2) + "\n")
+    write_text(out, json.dumps(found, indent=2) + "\n")
+    write_text(out.with_suffix(".md"), table(found))
     for verb, measured in found["start"].items():
         print(f"{verb}: start {measured['seconds']} s, imports {measured['imports']} s, {measured['modules']} modules")
     print("help:", ", ".join(f"{verb} {seconds} s" for verb, seconds in found["help"].items()))

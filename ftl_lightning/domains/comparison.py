@@ -13,9 +13,9 @@ from ftl_lightning.data.features import InitialStates
 
 OURS, FINE_TUNED = "FTL-IGM", "LoRA fine-tuning"
 """Names of the paper's method, and of the baseline that learns a concept with an adapter of the whole network."""
-WITH_MODES, WITH_KNOTS, WITH_ADAPTER, CHOSEN = "with modes", "over time", "with adapter", "form chosen"
+WITH_MODES, WITH_KNOTS, WITH_ADAPTER, CHOSEN = "with modes", "with knots", "with adapter", "form chosen"
 FORMS = (WITH_MODES, WITH_KNOTS, WITH_ADAPTER, CHOSEN)
-"""Forms of a method beyond the paper, in the order in which their names are joined, as in ``'with modes over time'``."""
+"""Forms of a method beyond the paper, in the order in which their names are joined, as in ``'with modes, with knots'``."""
 
 
 class Compared(NamedTuple):

@@ -9,6 +9,7 @@ from dataclasses import replace
 from typing import Any
 
 import lightning.pytorch as pl
+import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 
 from ftl_lightning.domains.domain import Domain
@@ -26,6 +27,8 @@ from ftl_lightning.services.validation import check_count
 from ftl_lightning.training.checkpoint import Random
 from ftl_lightning.training.data import InversionData, PretrainingData
 
+FIRST = 100
+"""Steps of ``fit`` after which behaviour is evaluated first."""
 _LOG = logging.getLogger(__name__)
 
 
@@ -76,7 +79,7 @@ class Evaluator(pl.Callback):
         self.diversity, self.films, self.variant = diversity, films, variant
         self.fit_episodes, self.environment, self.success = fit_episodes, environment, success
         self.judged: list[TaskResult] = []
-        self._projected = False
+        self._projected = self._began = False
 
     def _suite_names(self, data: pl.LightningDataModule) -> tuple[str, ...]:
         """Names of the evaluated suites."""
@@ -141,10 +144,34 @@ class Evaluator(pl.Callback):
 
     on_fit_start = on_validation_start = on_test_start = _check
 
+    def on_train_batch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule, *_: Any) -> None:
+        """Evaluate after :data:`FIRST` steps of ``fit``, if no validation comes earlier, without pictures.
+
+        The model does not depend on it.
+        """
+        pretrains = isinstance(_data(trainer), PretrainingData) and trainer.enable_validation
+        if pretrains and not self._began and trainer.global_step == FIRST < trainer.val_check_batch:
+            self._began = True
+            random = Random.now(pl_module.device, 0)
+            with torch.no_grad():
+                means = self._evaluate(trainer, pl_module)
+            random.restore(pl_module.device)
+            for logger in trainer.loggers:
+                logger.log_metrics(means, trainer.global_step)
+
     def on_validation_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Evaluate while fitting and in ``validate``."""
         if trainer.sanity_checking:
             return
+        means = self._evaluate(trainer, pl_module)
+        pl_module.log_dict(means, batch_size=1, sync_dist=True)
+        if trainer.is_global_zero:
+            ended = trainer.state.fn != "fit" or trainer.global_step >= trainer.max_steps  # films take as long as the training
+            module = evaluable(pl_module)
+            self._draw(trainer, module, project=not self._projected, film=ended)  # training embeddings do not change while fitting
+
+    def _evaluate(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> dict[str, float]:
+        """Generate and judge the behaviour of all tasks; return the means over each setting."""
         module, data = evaluable(pl_module), _data(trainer)
         means: dict[str, float] = {}
         if trainer.is_global_zero:  # rank 0 evaluates, the other ranks wait
@@ -157,10 +184,7 @@ class Evaluator(pl.Callback):
         means, random = trainer.strategy.broadcast((means, Random.now(pl_module.device, 0)))
         if not trainer.is_global_zero:
             random.restore(pl_module.device)
-        pl_module.log_dict({f"val/{name}": value for name, value in means.items()}, batch_size=1, sync_dist=True)
-        if trainer.is_global_zero:
-            ended = trainer.state.fn != "fit" or trainer.global_step >= trainer.max_steps  # films take as long as the training
-            self._draw(trainer, module, project=not self._projected, film=ended)  # training embeddings do not change while fitting
+        return {f"val/{name}": value for name, value in means.items()}
 
     def on_test_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Evaluate in ``test`` and at the end of ``invert``."""

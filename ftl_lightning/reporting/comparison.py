@@ -203,7 +203,7 @@ def short_overview(results: pd.DataFrame) -> Table:
         lines.append(
             [
                 _subject(domain, setting, metric),
-                ", ".join(f"{form.replace(f' {CHOSEN}', f' ({CHOSEN})')}: {cell}" if form else cell for form, cell in ours)
+                "; ".join(f"{form.replace(f', {CHOSEN}', f' ({CHOSEN})')}: {cell}" if form else cell for form, cell in ours)
                 or MISSING,
                 MISSING if rival is None else f"{label(*rival)} {_cell(domain, rows, rival, setting, metric)}",
                 ", ".join(f"{name} {mean:.2f}" for name, mean in best) or MISSING,

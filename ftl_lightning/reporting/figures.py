@@ -22,16 +22,16 @@ from ftl_lightning.reporting.table import lookup, main_omega, of_method, select,
 from ftl_lightning.reporting.tables import AXES, labelled, main_rows, points
 from ftl_lightning.services.text import figure_text
 
-_MODES_OVER_TIME = f"{WITH_MODES} {WITH_KNOTS}"
+_MODES_KNOTS = f"{WITH_MODES}, {WITH_KNOTS}"
 OF_METHODS: Mapping[Compared, str] = {
     PAPERS_METHOD: "#0072b2",
     Compared(OURS, CHOSEN): "#56b4e9",
-    Compared(OURS, f"{WITH_KNOTS} {CHOSEN}"): "#56b4e9",
+    Compared(OURS, f"{WITH_KNOTS}, {CHOSEN}"): "#56b4e9",
     Compared(OURS, WITH_MODES): "#44aa99",
     Compared(OURS, WITH_KNOTS): "#999933",
-    Compared(OURS, _MODES_OVER_TIME): "#332288",
+    Compared(OURS, _MODES_KNOTS): "#332288",
     Compared(OURS, WITH_ADAPTER): "#aa4499",
-    Compared(OURS, f"{_MODES_OVER_TIME} {WITH_ADAPTER}"): "#661100",
+    Compared(OURS, f"{_MODES_KNOTS}, {WITH_ADAPTER}"): "#661100",
     Compared("BC"): "#e69f00",
     Compared("CVAE"): "#d55e00",
     Compared("in-context"): "#009e73",

@@ -37,7 +37,7 @@ from ftl_lightning.training.method import Method
 
 _USUAL = InversionSettings()
 FORMS = {
-    **{AUTO: CHOSEN, MODES: WITH_MODES, ADAPTED: WITH_ADAPTER, MIXED: f"{WITH_MODES} {WITH_ADAPTER}", COMBINED: COMBINED},
+    **{AUTO: CHOSEN, MODES: WITH_MODES, ADAPTED: WITH_ADAPTER, MIXED: f"{WITH_MODES}, {WITH_ADAPTER}", COMBINED: COMBINED},
     **{form: f"{form}, not learned" for form in NOT_LEARNED},
 }
 """Names in tables of forms that override modes and adapter."""
@@ -100,7 +100,7 @@ class InversionModule(Adaptation):
         }
         return Labels(
             method.name if not fine_tuned else FINE_TUNED if method.name == OURS else f"{method.name}, {FINE_TUNED}",
-            "" if fine_tuned else " ".join(word for word in (form, decided) if word),
+            "" if fine_tuned else ", ".join(word for word in (form, decided) if word),
             ", ".join([*self.model.traits, span, *(text for text, applies in parts.items() if applies)]),
         )
 

@@ -66,7 +66,7 @@ class Method:
 
     def form(self, hparams: Mapping[str, Any]) -> str:
         """Form of concepts for these options; empty for the paper's form."""
-        return " ".join(form.name for form in self.forms if hparams[form.option] != form.usual)
+        return ", ".join(form.name for form in self.forms if hparams[form.option] != form.usual)
 
 
 def check_present(domain: "Domain") -> None:

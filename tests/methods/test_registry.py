@@ -89,10 +89,10 @@ def test_an_adaptation_adapts_models_of_some_kinds(adaptation: type[Adaptation],
 
 
 def test_a_form_is_told_by_the_option_that_decides() -> None:
-    method = Method("name", "kind", forms=(Form("with modes", "modes", 1), Form("over time", "knots", 1)))
+    method = Method("name", "kind", forms=(Form("with modes", "modes", 1), Form("with knots", "knots", 1)))
     assert method.form({"modes": 1, "knots": 1}) == ""
     assert method.form({"modes": "each", "knots": 1}) == "with modes"
-    assert method.form({"modes": 2, "knots": 4}) == "with modes over time"
+    assert method.form({"modes": 2, "knots": 4}) == "with modes, with knots"
 
 
 def test_a_package_of_ones_own_offers_a_method_beside_ours_and_never_in_place_of_one(package: None) -> None:

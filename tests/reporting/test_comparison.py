@@ -123,8 +123,8 @@ def test_the_overview_takes_in_domains_whose_methods_were_all_measured_in_their_
     assert pushed["LoRA fine-tuning"] == f"{tuned:.2f}"
     assert "[" not in pushed["FTL-IGM"]  # the paper's number is a robot's
     moved = lines.loc["motion: new concept, rule"]
-    assert moved["lead"].startswith("with modes over time with adapter: ")
-    assert re.search(r"with modes over time \d.*over time form chosen \d", moved["FTL-IGM"])
+    assert moved["lead"].startswith("with modes, with knots, with adapter: ")
+    assert re.search(r"with modes, with knots \d.*with knots, form chosen \d", moved["FTL-IGM"])
 
 
 def expect_narrow(rows: pd.DataFrame, whole: Table) -> list[Table]:

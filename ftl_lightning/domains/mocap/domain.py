@@ -192,7 +192,7 @@ DOMAIN = Domain(
         exports={".bvh": deferred("ftl_lightning.domains.mocap.bvh:bvh")},
     ),
     comparison=Comparison(
-        ours=Compared(OURS, f"{WITH_MODES} {WITH_KNOTS} {WITH_ADAPTER}"),
+        ours=Compared(OURS, f"{WITH_MODES}, {WITH_KNOTS}, {WITH_ADAPTER}"),
         headline="rule",
         references={"frozen frame": _frozen},
         fresh=False,  # recordings are finite
