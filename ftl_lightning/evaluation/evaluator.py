@@ -150,7 +150,7 @@ class Evaluator(pl.Callback):
         The model does not depend on it.
         """
         pretrains = isinstance(_data(trainer), PretrainingData) and trainer.enable_validation
-        if pretrains and not self._began and trainer.global_step == FIRST < trainer.val_check_batch:
+        if pretrains and not self._began and trainer.global_step == FIRST < (trainer.val_check_batch or torch.inf):
             self._began = True
             random = Random.now(pl_module.device, 0)
             with torch.no_grad():
