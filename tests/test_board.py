@@ -41,11 +41,11 @@ def test_accuracy_has_a_point_before_the_first_validation_and_the_model_is_the_s
 ) -> None:
     small = ["--data.samples_per_concept=2", "--data.validation_per_concept=1", "--data.steps_per_epoch=4", "--trainer.max_steps=4"]
     small += ["--model.denoiser_args={hidden_dim: 32, depth: 2, condition_dim: 16, dropout: 0.1}", "--evaluation.samples=2"]
-    small += ["--trainer.enable_progress_bar=false", f"--config={ROOT}/conf/object_rearrangement.yaml"]
+    small = ["fit", f"--config={ROOT}/conf/object_rearrangement.yaml", *small, "--trainer.enable_progress_bar=false"]
     for first, steps in ((2, [2, 3]), (100, [3])):
         monkeypatch.setattr(evaluator, "FIRST", first)
         place = tmp_path / str(first)
-        assert main(["fit", *small, f"--model.output={place}/model", f"--trainer.logger.init_args.save_dir={place}"]) == 0
+        assert main([*small, f"--model.output={place}/model", f"--trainer.logger.init_args.save_dir={place}"]) == 0
         events = EventAccumulator(str(place / "object_rearrangement" / "fit")).Reload()
         assert [event.step for event in events.Scalars("accuracy/training concept")] == steps
     one, other = (tmp_path / name / "model" / "model.safetensors" for name in ("2", "100"))
