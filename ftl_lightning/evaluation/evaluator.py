@@ -79,7 +79,7 @@ class Evaluator(pl.Callback):
         self.diversity, self.films, self.variant = diversity, films, variant
         self.fit_episodes, self.environment, self.success = fit_episodes, environment, success
         self.judged: list[TaskResult] = []
-        self._projected = self._began = False
+        self._drawn = self._began = False
 
     def _suite_names(self, data: pl.LightningDataModule) -> tuple[str, ...]:
         """Names of the evaluated suites."""
@@ -160,15 +160,14 @@ class Evaluator(pl.Callback):
                 logger.log_metrics(means, trainer.global_step)
 
     def on_validation_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Evaluate while fitting and in ``validate``."""
+        """Evaluate while fitting and in ``validate``; while fitting, draw at the first and the last validation."""
         if trainer.sanity_checking:
             return
         means = self._evaluate(trainer, pl_module)
         pl_module.log_dict(means, batch_size=1, sync_dist=True)
-        if trainer.is_global_zero:
-            ended = trainer.state.fn != "fit" or trainer.global_step >= trainer.max_steps  # films take as long as the training
-            module = evaluable(pl_module)
-            self._draw(trainer, module, project=not self._projected, film=ended)  # training embeddings do not change while fitting
+        ended = trainer.state.fn != "fit" or trainer.global_step >= trainer.max_steps
+        if trainer.is_global_zero and (ended or not self._drawn):  # pictures take several times as long as sampling them
+            self._draw(trainer, evaluable(pl_module), project=not self._drawn, film=ended)  # training embeddings do not change
 
     def _evaluate(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> dict[str, float]:
         """Generate and judge the behaviour of all tasks; return the means over each setting."""
@@ -225,7 +224,7 @@ class Evaluator(pl.Callback):
                 _LOG.warning("domain %s: its pictures cannot be drawn: %r", module.domain.name, error)
             if project:
                 log_projector(logger, module.concept_points(), trainer.global_step)
-                self._projected = True
+        self._drawn = True
 
 
 def _data(trainer: pl.Trainer) -> PretrainingData | InversionData:

@@ -199,11 +199,11 @@ def short_overview(results: pd.DataFrame) -> Table:
             if (named := [(name, mean) for name, mean in means.items() if (ORACLE in str(name) or name == FRESH) == kind])
         ]
         lead = least_certain(_leads(domain, rows, setting, metric))
-        prefix = f"{domain.comparison.ours.form}: " if domain.comparison.ours.form else ""
+        prefix = f"{together(domain.comparison.ours.form)}: " if domain.comparison.ours.form else ""
         lines.append(
             [
                 _subject(domain, setting, metric),
-                "; ".join(f"{form.replace(f', {CHOSEN}', f' ({CHOSEN})')}: {cell}" if form else cell for form, cell in ours)
+                "; ".join(f"{together(form)}: {cell}" if form else cell for form, cell in ours)
                 or MISSING,
                 MISSING if rival is None else f"{label(*rival)} {_cell(domain, rows, rival, setting, metric)}",
                 ", ".join(f"{name} {mean:.2f}" for name, mean in best) or MISSING,
@@ -214,10 +214,15 @@ def short_overview(results: pd.DataFrame) -> Table:
     caption = (
         f"New concepts, mean ± standard error over tasks{brackets}. {OURS} (ours): in the paper's form "
         "(parametrisation) unless another is named; networks, representations, most losses and some guidance weights are not the "
-        "paper's. Lead: the paper's or the named form minus the best pretrained baseline; 95 % interval over tasks"
+        "paper's. Lead: the paper's form, or the form that the lead names, minus the best pretrained baseline; 95 % interval over tasks"
     )
     head = ["domain: setting, metric", OURS, "best pretrained baseline", "best without pretraining; oracle", "lead"]
     return make_table(None, "overview", caption, lines, head)
+
+
+def together(form: str) -> str:
+    """A form of several parts in a cell: ``'with modes, knots'``, ``'with knots (form chosen)'``."""
+    return form.replace(f", {CHOSEN}", f" ({CHOSEN})").replace(", with ", ", ")
 
 
 def overview_tables(results: pd.DataFrame) -> list[Table]:
