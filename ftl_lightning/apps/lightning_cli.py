@@ -25,12 +25,14 @@ from ftl_lightning.services.command_line import Arguments
 from ftl_lightning.services.configuration import parts
 from ftl_lightning.services.errors import UserError, mistake_behind, require, short
 from ftl_lightning.services.store import modified
-from ftl_lightning.services.text import say
+from ftl_lightning.services.text import counted, say
 from ftl_lightning.services.validation import check_range
 from ftl_lightning.training.board import TrainingBar, accuracies
 from ftl_lightning.training.checkpoint import last_checkpoint, read_checkpoint
 from ftl_lightning.training.trainer import Trainer, one_voice
 
+NAMED = 3
+"""Number of training concepts that are printed."""
 LOGS = Path("logs")
 """Folder of the files of runs without a logger."""
 
@@ -135,8 +137,15 @@ class CommandLine(LightningCLI):
         return str(self.model.hparams.get("output") or Path(self.trainer.log_dir or self.trainer.default_root_dir) / "pretrained")
 
     def after_fit(self) -> None:
-        """Print the folder of the model."""
+        """Print the folder of the model, and how to learn a concept with it."""
         say(", ".join((f"pretrained model: {self._model_folder()}", *accuracies(self.trainer))))
+        say(f"to learn a concept: python -m ftl_lightning invert {self._model_folder()} FILE")
+
+    def before_invert(self) -> None:
+        """Print the model and some of its training concepts."""
+        concepts = self.model.model.config.training_concepts
+        some = ", ".join(short(text, 30) for text in concepts[:NAMED]) + (", ..." if len(concepts) > NAMED else "")
+        say(f"model: {self.model.hparams['pretrained']} ({counted(len(concepts), 'training concept')}: {some})")
 
     def after_invert(self) -> None:
         """Print the log folder."""

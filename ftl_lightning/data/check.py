@@ -17,6 +17,7 @@ from ftl_lightning.data.demonstrations import Demonstrations, in_sequence, paths
 from ftl_lightning.data.features import BLOCK
 from ftl_lightning.data.kinds import LINEAR, Columns, resolved
 from ftl_lightning.services.errors import UserError, about, short
+from ftl_lightning.services.text import counted
 
 T = TypeVar("T")
 MOST_NAMED = 6  # demonstrations to list individually
@@ -101,7 +102,7 @@ def mended(states: Tensor, lengths: Tensor) -> tuple[Tensor, tuple[Finding, ...]
         message = "its padding is not finite; pad with the last state"
         if len(times):
             message = f"{len(times)} of {length} time steps are not finite (the first is {int(times[0])})"
-            message += f", in {len(columns)} columns; nothing can be learned from them"
+            message += f", in {counted(len(columns), 'column')}; nothing can be learned from them"
         findings.append(Finding(message, "error", (row,)))
         for column in columns:
             values = whole[row, :, column].numpy()

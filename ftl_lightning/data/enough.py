@@ -1,5 +1,6 @@
 """Whether a few demonstrations suffice, by their skill on left-out demonstrations, and which is an outlier; without learning."""
 
+import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -76,10 +77,10 @@ class Enough:
             The result; ``None`` for fewer than :data:`FEWEST` demonstrations, or paths of more than :data:`LARGEST` numbers.
         """
         out = tuple(sorted(without))
-        demonstrations = demonstrations.rows([row for row in range(len(demonstrations)) if row not in out])
-        count = len(demonstrations)
-        if count < FEWEST or horizon * demonstrations.states.shape[2] > LARGEST:
+        rows = [row for row in range(len(demonstrations)) if row not in out]
+        if (count := len(rows)) < FEWEST or horizon * demonstrations.states.shape[2] > LARGEST:
             return None
+        demonstrations = demonstrations.rows(rows)
         every, fresh = _skills(demonstrations, horizon, training, followed)
         sizes = sorted(next(iter(every.values())))
         last = sizes[-1]
@@ -107,7 +108,8 @@ class Enough:
         return self.more == 0
 
     def __str__(self) -> str:
-        curve = ", ".join(f"{skill:.2f} from {size}" for size, skill in self.skills.items())
+        # Rounded down: 0.857 is not yet HIGH.
+        curve = ", ".join(f"{math.floor(100 * skill) / 100:.2f} from {size}" for size, skill in self.skills.items())
         without = f"without {numbered(self.without)}, " if self.without else ""
         if self.several:
             return f"enough: {without}no: they differ from each other as much as demonstrations of different training concepts"

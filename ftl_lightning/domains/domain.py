@@ -301,7 +301,7 @@ class Domain(Shown):
 
     def __post_init__(self) -> None:
         if self.show is _DERIVED:
-            object.__setattr__(self, "show", line_drawings(self.plans.columns))
+            object.__setattr__(self, "show", line_drawings(self.plans.columns, self.plans.units))
 
     def _words(self) -> Iterator[str]:
         yield repr(self.name)

@@ -105,17 +105,29 @@ def _pixels(figure: "Figure") -> NDArray[np.uint8]:
     return np.asarray(canvas.buffer_rgba()).copy()
 
 
-def line_drawings(columns: Sequence[str]) -> Show:
-    """Generic pictures of states: paths in two or three dimensions, which are also filmed, otherwise lines over time."""
+def line_drawings(columns: Sequence[str], units: Sequence[str] = ()) -> Show:
+    """Generic pictures of states: paths in two or three dimensions, which are also filmed, otherwise lines over time.
+
+    Of three columns, of which the third alone has another unit, such as a speed, the path of the first two is drawn.
+    """
+    flat = len(columns) == 3 and len(units) == 3 and units[0] == units[1] != units[2]
+    columns = columns[:2] if flat else columns
+    shown = slice(len(columns))
 
     def picture(states: Tensor, right: Sequence[bool] | None, title: str, starts: InitialStates | None) -> "Figure":
-        return _grid(columns, [Drawn("", states, right=right)], title)
+        return _grid(columns, [Drawn("", states[..., shown], right=right)], title)
 
     def both(demonstrations: Tensor, samples: Tensor, title: str, right: Sequence[bool] | None) -> "Figure":
-        return _grid(columns, [Drawn("demonstrations", demonstrations), Drawn("samples", samples, right=right)], title)
+        groups = [Drawn("demonstrations", demonstrations[..., shown]), Drawn("samples", samples[..., shown], right=right)]
+        return _grid(columns, groups, title)
 
-    vector_film = path_film if len(columns) == 2 else line_film
-    return Show(picture, film if len(columns) in (2, 3) else None, vector_film=vector_film, beside=both)
+    filmed = path_film if len(columns) == 2 else line_film
+    return Show(
+        picture,
+        (lambda states: film(states[..., shown])) if len(columns) in (2, 3) else None,
+        vector_film=lambda states, starts: filmed(states[..., shown], starts),
+        beside=both,
+    )
 
 
 def framed(count: int, right: Sequence[bool] | None, title: str, columns: int, size: tuple[float, float]) -> "Figure":

@@ -121,7 +121,7 @@ def card(path: Path, known_as: str, shown: str, with_demonstrations: bool) -> st
     }
     if quality is not None:
         right = "" if quality.right is None else f"{quality.metric} {quality.right:.2f}, "
-        numbers = ", ".join(f"{name} {getattr(quality, name):.2f}" for name in ("spread", "novelty", "roughness"))
+        numbers = f"spread {quality.spread:.2f}, relative novelty {quality.novelty:.2f}, roughness {quality.roughness:.2f}"
         rows["quality"] = f"{right}{numbers} ({counted(quality.samples, 'sample')}, started like the demonstrations)"
     files = {CONCEPT: "the concept, numbers and texts alone", shown: "what it generates"}
     files |= {DEMONSTRATIONS: "what it was learned from"} if with_demonstrations else {}

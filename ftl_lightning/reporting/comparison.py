@@ -203,8 +203,7 @@ def short_overview(results: pd.DataFrame) -> Table:
         lines.append(
             [
                 _subject(domain, setting, metric),
-                "; ".join(f"{together(form)}: {cell}" if form else cell for form, cell in ours)
-                or MISSING,
+                "; ".join(f"{together(form)}: {cell}" if form else cell for form, cell in ours) or MISSING,
                 MISSING if rival is None else f"{label(*rival)} {_cell(domain, rows, rival, setting, metric)}",
                 ", ".join(f"{name} {mean:.2f}" for name, mean in best) or MISSING,
                 MISSING if lead is None else prefix + (f"{lead.amount}, {lead.shown}" if lead.baseline == rival else str(lead)),

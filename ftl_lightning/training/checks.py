@@ -230,8 +230,8 @@ def combination_line(model: ConceptModel, demonstrations: Demonstrations, settin
 def longer_than_plans(demonstrations: Demonstrations, model: ConceptModel) -> str:
     """Note about the use of demonstrations that are longer than the model's plans; empty without any.
 
-    None is needed for closed-loop domains with observations at every time, where a plan may start at any time, and where a plan
-    covers at least :data:`COVERED_BY_A_PLAN` of the longest demonstration.
+    None is needed for closed-loop domains with observations at every time, where a plan may start at any time, and in domains where
+    a plan covers at least :data:`COVERED_BY_A_PLAN` of the longest demonstration.
     """
     window, plans = model.window, model.domain.plans
     longest, shortest = int(demonstrations.lengths.max()), int(demonstrations.lengths.min())
@@ -245,7 +245,7 @@ def longer_than_plans(demonstrations: Demonstrations, model: ConceptModel) -> st
             f"as {names} is known at the first time alone"
         )
     executed = bool(demonstrations.observed) and model.domain.closed_loop is not None and plans.exponent(window) == 1
-    if executed or window >= COVERED_BY_A_PLAN * longest:
+    if executed or (model.examples is None and window >= COVERED_BY_A_PLAN * longest):
         return ""
     # The same exponent decides where windows start, see Demonstrations.starts.
     where = "anywhere" if plans.exponent(window) == 1 else "anywhere, mostly early"

@@ -167,7 +167,7 @@ def _of_demonstrations(file: str) -> tuple[list[str], list[Json]]:
     domain = _domain_of(data)
     with about(file):
         data = data.fitted(domain.observed) if domain is not None else data
-    show = line_drawings(data.state_names) if domain is None else domain.show
+    show = line_drawings(data.state_names, data.state_units) if domain is None else domain.show
     names = list(dict.fromkeys(data.concepts))
     notes = [str(data)]
     if len(names) > MOST_CONCEPTS:

@@ -274,7 +274,7 @@ def by_skill(
     skills = {name: left.skill(value.score.mean()) for name, value in every.items()}
     rival = max((*references, VARIED), key=lambda name: skills[name])
     beside = f"the best reference, the {rival}, has {skills[rival]:.2f}"
-    varied = maker if not variation or maker == VARIED else f"{maker}, varied"
+    varied = maker if not variation or maker == VARIED else f"deformed {maker}"
     called = form if not share else varied if share == 1 else f"{form} and {varied}"
     skills[called] = left.skill(mixture[number].mean())
     numbers = {f"{SKILL}{name}": round(value, 4) for name, value in skills.items()}

@@ -76,7 +76,7 @@ class Quality:
         """Description, such as ``'spread 0.31 (collapsed)'``; without a remark within the thresholds."""
         words = [
             f"spread {self.spread:.2f}{_remark(self.spread, COLLAPSED, 'collapsed', SCATTERED, 'scattered')}",
-            f"novelty {self.novelty:.2f}{_remark(self.novelty, COPIES, 'copies')}",
+            f"relative novelty {self.novelty:.2f}{_remark(self.novelty, COPIES, 'copies')}",
             f"roughness {self.roughness:.2f}{_remark(self.roughness, 0, '', ROUGH, 'rougher than your demonstrations')}",
         ]
         return ", ".join(words)
