@@ -163,7 +163,7 @@ def figure(series: dict[str, dict[str, Any]]) -> Figure:
             rows = found["rows"]
             panel.loglog([row["value"] / rows[0]["value"] for row in rows], [row[key] for row in rows], "o-", label=name)
         panel.set(xlabel="value, in multiples of the smallest", ylabel="processor seconds" if key == "seconds" else "MB added")
-    panels[0].legend()
+    drawn.legend(*panels[0].get_legend_handles_labels(), loc="outside right upper")
     return drawn
 
 
