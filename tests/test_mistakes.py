@@ -337,7 +337,9 @@ def test_the_version_of_a_checkpoint(capsys: Told) -> None:
     [
         ([*FIT, "--trainer.max_steps=many"], "key 'trainer.max_steps': expected int, found many"),
         (["fit", "--trainer.max_steps=1"], "config: expected --config FILE"),
-        ([*FIT, "--trainer.max_step=1"], "unrecognized arguments: --trainer.max_step=1"),
+        ([*FIT, "--trainer.max_step=1"], "max_step=1; see --help; did you mean --trainer.max_steps?"),
+        ([*SCENES, "--cuont=1"], "unrecognized arguments: --cuont=1; see --help; did you mean --count?"),
+        (["chekc", "five.npz"], "found 'chekc'; did you mean check?"),
         (["concepts", "object_rearrangement", "--fold=x"], "unrecognized arguments: --fold=x"),
         (["generate", "tabletop", "--out=z.mat"], "z.mat: expected the name of an .npz or .safetensors file"),
         ([*SCENES, RIGHT, "--out=z.mat"], "z.mat: expected the name of an .npz or .safetensors file"),

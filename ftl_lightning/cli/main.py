@@ -1,5 +1,7 @@
 """Command line: a table of verbs. Verbs import what they need when they run, for a fast start."""
 
+import difflib
+import inspect
 import json
 import os
 import sys
@@ -14,7 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from ftl_lightning.cli import concepts, demonstrations, experiments, pages
 from ftl_lightning.services import trust
-from ftl_lightning.services.command_line import TRAINER, Arguments, check_inputs, command_checks, one_line
+from ftl_lightning.services.command_line import TRAINER, Arguments, check_inputs, command_checks, one_line, option_names
 from ftl_lightning.services.errors import LONGEST, Note, UserError, mistake_of_machine, require, short
 from ftl_lightning.services.progress import waiting
 from ftl_lightning.services.text import any_terminal, line, say
@@ -132,7 +134,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except OmegaConfBaseException as error:
         return _refused(f"configuration: {str(error).splitlines()[0]}")
     except ArgumentError as error:
-        return _refused(one_line(str(error), verb, read))
+        return _refused(one_line(str(error), verb, read) + _meant(str(error), verb, read))
     except KeyboardInterrupt:
         return _interrupted()
     except (OSError, MemoryError, RuntimeError, ValueError) as error:
@@ -178,6 +180,17 @@ def _refused(message: str) -> int:
     return 2
 
 
+def _meant(message: str, verb: str, arguments: Arguments) -> str:
+    """The known option nearest to an unknown one that a message names; empty without any."""
+    if (command := COMMANDS.get(verb, _INVERT if arguments.positional else None)) is not None:
+        known = [*inspect.signature(command.options or command.function).parameters]
+    else:
+        known = [key for path in arguments.configurations() for key in option_names(path, verb)]
+    unknown = [name for name, _ in arguments.options if name not in known and name.rpartition(".")[2] in message]
+    near = [match for name in unknown for match in difflib.get_close_matches(name, known, 1, cutoff=0.7)]
+    return f"; did you mean --{near[0]}?" if near else ""
+
+
 def _interrupted() -> int:
     say("interrupted: what was written before is whole", error=True)
     return 130
@@ -203,7 +216,9 @@ def _dispatch(verb: str, arguments: Arguments) -> None:
 
         run(verb, arguments)
     else:
-        raise UserError(f"verb: expected one of {', '.join((*TRAINER_VERBS, *COMMANDS))}, found {verb!r}")
+        verbs = (*TRAINER_VERBS, *COMMANDS)
+        near = "".join(f"; did you mean {match}?" for match in difflib.get_close_matches(verb, verbs, 1))
+        raise UserError(f"verb: expected one of {', '.join(verbs)}, found {verb!r}{near}")
 
 
 def _overview() -> str:

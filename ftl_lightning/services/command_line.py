@@ -255,6 +255,19 @@ def one_line(message: str, verb: str, arguments: Arguments) -> str:
     return f"{short(plain, LONGEST - 30)}; see --help"
 
 
+def option_names(path: str, verb: str) -> list[str]:
+    """Names of the options that a configuration file and its defaults set, as on the command line."""
+    names = [".".join(part for part in keys if part != "init_args") for keys in _leaves(load(path, verb), ())]
+    return list(dict.fromkeys(names))
+
+
+def _leaves(keys: Mapping[str, Any], above: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
+    for key, value in keys.items():
+        yield (*above, key)
+        if isinstance(value, Mapping):
+            yield from _leaves(value, (*above, key))
+
+
 def _line(path: Path, key: Sequence[str], excluded: Set[str]) -> int | None:
     """Line of a key, which may be a suffix, in a YAML file without the excluded sections; ``None`` if it is missing."""
     try:
