@@ -43,8 +43,9 @@ def test_a_fit_goes_on_from_a_store_and_writes_its_model_there(
     assert "starts from the beginning" not in capsys.readouterr().out
     assert main([*remote, "--trainer.max_steps=4", "--ckpt_path=memory://runs/a/none.ckpt"]) == 2
     assert "expected a checkpoint file, found nothing at memory://runs/a/none.ckpt" in capsys.readouterr().err
+    assert main([*remote, "--trainer.max_steps=6", "--ckpt_path=memory://runs/a/last.ckpt"]) == 0
     there = FewShot.from_pretrained("memory://models/a")
-    assert there.model.config.training["max_steps"] == 4
+    assert there.model.config.training["max_steps"] == 6
     assert main([*SMALL, "--trainer.max_steps=2", f"--model.output={tmp_path}/first"]) == 0
     first = FewShot.from_pretrained(tmp_path / "first").model.state_dict()
     assert not all(torch.equal(value, first[name]) for name, value in there.model.state_dict().items())
@@ -55,8 +56,9 @@ def test_a_fit_goes_on_from_a_store_and_writes_its_model_there(
 
 
 def test_a_url_of_the_local_file_system_is_a_store_too(tmp_path: Path) -> None:
-    (tmp_path / "config.json").write_text("{}")
-    assert (fetched(f"file://{tmp_path}", ["config.json", "none"]) / "config.json").read_text() == "{}"
+    for content in ("{}", "{1: 2}"):
+        (tmp_path / "config.json").write_text(content)
+        assert (fetched(f"file://{tmp_path}", ["none", "config.json"]) / "config.json").read_text() == content
 
 
 @pytest.mark.parametrize(

@@ -47,26 +47,30 @@ def _copies() -> tempfile.TemporaryDirectory[str]:
 
 
 _FETCHED: dict[tuple[str, ...], Path] = {}
-"""Local copies by URL and names of files."""
+"""Local copies by URL, names of files, and version of the last file."""
 
 
 def fetched(url: str, names: Sequence[str]) -> Path:
-    """Copy the existing files of a remote folder to a local folder, once in a process, and return the local folder.
+    """Copy the existing files of a remote folder to a local folder, and return the local folder.
+
+    They are copied once in a process, and again after the last file has changed.
 
     Raises:
         UserError: if the store cannot be reached, or a file is larger than :func:`~ftl_lightning.services.files.most_bytes`.
     """
-    if (url, *names) in _FETCHED:
-        return _FETCHED[url, *names]
-    folder = Path(tempfile.mkdtemp(dir=_copies().name))
     with _store(url) as (files, path):
+        last = f"{path}/{names[-1]}"
+        key = (url, *names, files.ukey(last) if files.isfile(last) else "")
+        if key in _FETCHED:
+            return _FETCHED[key]
+        folder = Path(tempfile.mkdtemp(dir=_copies().name))
         for name in names:
             if files.isfile(f"{path}/{name}"):
                 size, most = files.size(f"{path}/{name}"), most_bytes()
                 require(size <= most, f"{url}/{name}", f"at most {most} bytes; if it is honest, set {VARIABLE} to more", size)
                 files.get_file(f"{path}/{name}", str(folder / name))
-    _FETCHED[url, *names] = folder
-    return folder
+        _FETCHED[key] = folder
+        return folder
 
 
 def put(folder: Path, url: str, names: Sequence[str]) -> None:
@@ -79,5 +83,3 @@ def put(folder: Path, url: str, names: Sequence[str]) -> None:
         files.makedirs(path, exist_ok=True)
         for name in names:
             files.put_file(str(folder / name), f"{path}/{name}")
-    for key in [key for key in _FETCHED if key[0] == url]:
-        del _FETCHED[key]
