@@ -246,7 +246,8 @@ def uncalibrated(examples: Demonstrations, training: Sequence[str]) -> str:
     if counts[fewest] >= CALIBRATED:
         return ""
     needed = f"it needs {CALIBRATED} held-out demonstrations of each training concept"
-    return f"{RECOGNISED} is not shown: {needed}, and {short(fewest, 40)!r} has {counts[fewest]}"
+    found = f"{short(fewest, 40)!r} has {counts[fewest]}"
+    return f"{RECOGNISED} is not shown: {needed}, and {found}; fit with a larger data.validation_share"
 
 
 def _not_measured(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:

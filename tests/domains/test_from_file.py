@@ -116,12 +116,13 @@ def test_recognised_is_shown_only_where_ten_held_out_demonstrations_of_each_conc
             assert judged(domain, plans, "go between")["recognised"] > 0.5
             continue
         assert text == (
-            "recognised is not shown: it needs 10 held-out demonstrations of each training concept, and 'go right' has 9"
+            "recognised is not shown: it needs 10 held-out demonstrations of each training concept, and 'go right' has 9; "
+            "fit with a larger data.validation_share"
         )
         with pytest.warns(Note, match="recognised is not shown"):
             assert list(judged(domain, plans, "go between")) == ["end_point_within"]
     few = write(tmp_path / "few.npz")
-    with pytest.warns(Note, match="few.npz: recognised is not shown: it needs 10 held-out demonstrations of .* 'go right' has 1$"):
+    with pytest.warns(Note, match="few.npz: recognised is not shown: it needs 10 held-out demonstrations of .* 'go right' has 1;"):
         OwnData(few, {"recognised": 0.98}, encoder="hashing").setup("fit")
     many = write(tmp_path / "many.npz", count=20)
     with pytest.warns(Note, match=r"many.npz: recognised accepts [01]\.\d\d of held-out demonstrations by 10 others"):
