@@ -266,6 +266,7 @@ def test_the_list_of_concepts_does_not_hash_the_weights(opened: Workspace, monke
     assert all(concept["hash"] for concept in opened.state()["concepts"])
 
 
+@pytest.mark.slow
 def test_an_older_concept_of_the_same_kind_is_no_rival() -> None:
     strokes = Workspace("strokes")
     for name in ("first heart", "second heart"):
