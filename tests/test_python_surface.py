@@ -454,6 +454,9 @@ def test_longer_demonstrations_are_told_of(things: Things) -> None:
         "demonstrations of up to 161 steps are longer than the model's horizon of 128: they are learned from in windows of "
         "128 steps, which start anywhere, mostly early; a plan has 128 steps"
     )
+    strokes = FewShot.from_pretrained("strokes")  # of a user's data, where every end counts
+    path = np.zeros((strokes.model.window + 1, 2), dtype=np.float32)
+    assert "longer than the model's horizon" in longer_than_plans(strokes.demonstrations([path], name="still"), strokes.model)
     driving = FewShot.from_pretrained("driving").model  # which plans anew
     longer = Demonstrations.load(SHIPPED / "merge.safetensors").rows([0])
     assert longer.states.shape[1] > driving.window

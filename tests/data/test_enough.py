@@ -51,6 +51,12 @@ def test_what_goes_to_another_share_of_the_way_to_a_place_is_odd() -> None:
     assert score.outlier(concatenate([good.rows(range(4)), to_place(1, 21, -0.5, "new")])) == 4
 
 
+def test_a_skill_is_rounded_down_and_demonstrations_that_are_all_faulty_have_none(training: Demonstrations) -> None:
+    assert "0.85 from 4" in str(Enough("warped demonstrations", {3: 0.8, 4: 0.8599}, None, None))
+    five = drawn("heart", 5)
+    assert Enough.of(five, five.states.shape[1], training, without=range(5)) is None
+
+
 def test_five_alike_suffice_and_few_that_differ_in_kind_do_not(training: Demonstrations) -> None:
     horizon = training.states.shape[1]
     for known in (training, None):

@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from highway_env import utils
 from highway_env.vehicle.behavior import IDMVehicle
 
 from ftl_lightning.domains.driving import expert, traffic
 from ftl_lightning.domains.driving.environment import DrivingEnvironment
+from ftl_lightning.domains.driving.fast import _apart
 from ftl_lightning.domains.driving.scenarios import SCENARIOS, advance, arrived, make, observe, restore, save
 from ftl_lightning.domains.driving.traffic import (
     BARRIER,
@@ -102,6 +104,18 @@ def test_the_faster_simulation_is_the_published_one(name: str, seeds: tuple[int,
             np.testing.assert_array_equal(observe(fast), fast.observation_type.observe())
             if ended or late:
                 break
+
+
+def test_vehicles_that_are_apart_do_not_collide_in_the_published_test() -> None:
+    draw, apart = np.random.default_rng(0), 0
+    road = start("merge").road
+    for _ in range(2_000):
+        one, other = (IDMVehicle(road, draw.uniform(-5, 5, 2), draw.uniform(-np.pi, np.pi), draw.uniform(0, 30)) for _ in range(2))
+        moves = one.velocity / 15, other.velocity / 15
+        touching, will_touch, _ = utils.are_polygons_intersecting(one.polygon(), other.polygon(), *moves)
+        assert _apart(one, other, 1 / 15) == (not touching and not will_touch)
+        apart += not will_touch
+    assert 200 < apart < 1_800
 
 
 @pytest.mark.parametrize("name", SIMULATED)

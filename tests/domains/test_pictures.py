@@ -36,6 +36,18 @@ def test_behaviour_in_space_is_a_path_from_a_marked_start(columns: int) -> None:
     assert len({axes.get_xlim() for axes in figure.axes}) == 1  # all on one scale
 
 
+@pytest.mark.parametrize(("units", "name"), [(("m", "m", "m/s"), "rectilinear"), (("m",) * 3, "3d"), (("m", "s", "s"), "3d")])
+def test_of_a_path_with_a_speed_the_path_is_drawn(units: tuple[str, ...], name: str) -> None:
+    states = plans(2, 20, 3)
+    show = line_drawings(("x", "y", "speed"), units)
+    figure = show.picture(states, None, "a title", None)
+    assert {axes.name for axes in figure.axes} == {name}
+    if name == "rectilinear":
+        np.testing.assert_allclose(np.stack(figure.axes[0].lines[0].get_data(), axis=1), states[0, :, :2])
+        assert show.film is not None
+        np.testing.assert_array_equal(show.film(states[0])[-1], film(states[0, :, :2])[-1])
+
+
 @pytest.mark.parametrize("columns", [1, 4, 20])
 def test_other_behaviour_is_a_line_over_time_for_each_column(columns: int) -> None:
     states = plans(2, 20, columns)
