@@ -3,14 +3,13 @@
     python benchmarks/speed/samplers.py [--domains object_rearrangement agent] [--seeds 0 1 2] [--root FOLDER]
 
 Concepts of each domain's validation suite are learned in the shipped form, for each seed. Every sampler generates plans of the
-suite's tasks, compositions with training concepts included, from the same new initial states; where the suite has fewer than three
-tasks, those of the training concepts too. A sampler is *equal* if accuracy,
-diversity and energy score are each at most one standard error worse than those of DDPM; standard errors are over tasks and seeds,
-of paired differences. Diversity is the mean distance between plans from the same state, and the energy score (less is better)
-that for fresh behaviour from this state. Where plans are executed, accuracy is that of episodes. Seconds are of processor time
-for 500 plans, medians of interleaved calls. ``--root`` is the folder of recordings of human motion. What was measured is kept,
-and a run that is started again goes on from there. The table has the paper's sampler, the shipped one, and the fastest that is
-equal.
+suite's tasks, compositions with training concepts included, from the same new initial states; where the suite has fewer than
+three tasks, those of the training concepts too. A sampler is *equal* if accuracy, diversity and energy score are each at most one
+standard error worse than those of DDPM; standard errors are over tasks and seeds, of paired differences. Diversity is the mean
+distance between plans from the same state, and the energy score (less is better) that for fresh behaviour from this state. Where
+plans are executed, accuracy is that of episodes. Seconds are of processor time for 500 plans, medians of interleaved calls.
+``--root`` is the folder of recordings of human motion. What was measured is kept, and a run that is started again goes on from
+there. The table has the paper's sampler, the shipped one, and the fastest that is equal.
 """
 
 import argparse

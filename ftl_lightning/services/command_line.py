@@ -257,15 +257,8 @@ def one_line(message: str, verb: str, arguments: Arguments) -> str:
 
 def option_names(path: str, verb: str) -> list[str]:
     """Names of the options that a configuration file and its defaults set, as on the command line."""
-    names = [".".join(part for part in keys if part != "init_args") for keys in _leaves(load(path, verb), ())]
-    return list(dict.fromkeys(names))
-
-
-def _leaves(keys: Mapping[str, Any], above: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
-    for key, value in keys.items():
-        yield (*above, key)
-        if isinstance(value, Mapping):
-            yield from _leaves(value, (*above, key))
+    root = yaml.compose(OmegaConf.to_yaml(OmegaConf.create(load(path, verb))), Loader=yaml.SafeLoader)
+    return list(dict.fromkeys(".".join(part for part in names if part != "init_args") for names, _ in _keys(root, ())))
 
 
 def _line(path: Path, key: Sequence[str], excluded: Set[str]) -> int | None:

@@ -12,10 +12,10 @@ from ftl_lightning.data.normalization import Normalization
 from ftl_lightning.domains.domain import OWN, Domain, View
 from ftl_lightning.networks.conditions import Sizes
 from ftl_lightning.services.errors import UserError, about, short, shown
-from ftl_lightning.services.shipped import missing_model
+from ftl_lightning.services.shipped import MODEL_FILES, missing_model
 from ftl_lightning.services.validation import LARGEST, check_range, check_type, read_json
 
-CONFIG = "config.json"
+CONFIG = MODEL_FILES[-1]
 """File name in a model's folder."""
 VERSION = 2
 """Version of the configuration's format."""

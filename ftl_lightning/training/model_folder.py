@@ -27,8 +27,8 @@ from ftl_lightning.training.method import kinds, methods
 from ftl_lightning.training.model_config import CONFIG, VERSION, blank, check_domain, read_config
 
 M = TypeVar("M", bound=ConceptModel)
-EXAMPLES = "demonstrations.safetensors"
-"""File name of the examples in a model's folder."""
+WEIGHTS, EXAMPLES, _ = MODEL_FILES
+"""File names of a model's weights and examples."""
 
 
 def save_model(model: ConceptModel, folder: str | Path) -> None:
@@ -103,8 +103,6 @@ def read_model(kind: type[M], folder: str | Path, domain: Domain | None = None) 
     return model.requires_grad_(False).eval()
 
 
-WEIGHTS = "model.safetensors"
-"""File name in a model's folder."""
 MOST_PARAMETERS = 10_000
 """Maximum number of parameter tensors in a model from a file."""
 SPARE = 4
