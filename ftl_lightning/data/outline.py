@@ -1,5 +1,6 @@
 """Whether a part of a path is missing or added, by distances between the points of paths."""
 
+import math
 from functools import cache
 
 import torch
@@ -68,12 +69,39 @@ class Outline:
         made = self._points(frames, torch.where(finite[:, None, None], paths, 0), seen)
         return finite & (_farther(made, self._points(frames, known, its)) <= self.limit(len(known)))
 
+    def faults(self, paths: Tensor, observed: Observed, demonstrations: Demonstrations) -> list[list[Tensor]]:
+        """For each path, its added parts, and the missing parts of the nearest demonstration, moved to the path: ``(point, state)``
+        each. Arguments as for :meth:`whole`, which judges them; paths must be finite.
+        """
+        known, its = first_windows(demonstrations, self.horizon), vectors_of(demonstrations)
+        seen = {name: observed[name].flatten(1).float() for name in its}
+        frames, width = Frames.fit(known, its, self.setting.places), paths.shape[2]
+        made, base = self._points(frames, paths, seen), self._points(frames, known, its)
+        limit = _usual(base) * math.exp(self.limit(len(known)))
+        apart = torch.cdist(made[:, None], base[None])
+        forth, back = apart.amin(dim=3), apart.amin(dim=2)
+        shifts, its_shifts = frames.shift(seen, width), frames.shift(its, width)
+        parts = []
+        for row, demo in enumerate(torch.maximum(forth.amax(dim=2), back.amax(dim=2)).argmin(dim=1).tolist()):
+            path, other = paths[row], known[demo]
+            if self.setting.places:
+                moved = other - its_shifts[demo] + shifts[row]
+            else:
+                moved = path.mean(dim=0) + (other - other.mean(dim=0)) * self._size(path) / self._size(other)
+            parts.append([*_runs(path, forth[row, demo] > limit), *_runs(moved, back[row, demo] > limit)])
+        return parts
+
+    def _size(self, path: Tensor) -> Tensor:
+        """Root mean square of a path ``(horizon, state)`` around its mean."""
+        states = self.columns.encode(path) / self.spread
+        return (states - states.mean(dim=0)).square().mean().sqrt().clamp(min=1e-6)
+
     def _points(self, frames: Frames, paths: Tensor, seen: Observed) -> Tensor:
         """Points ``(path, point, 2 * column)`` of paths ``(path, horizon, state)``."""
         width, horizon = paths.shape[2], paths.shape[1]
         moved = paths - frames.shift(seen, width) + frames.shift(self.usual, width)
         states = ((self.columns.encode(moved) - self.centre) / self.spread).float()
-        states = states[:, torch.linspace(0, horizon - 1, min(horizon, POINTS)).round().long()]
+        states = states[:, _places(horizon)]
         if horizon < FEWEST:
             return states
         if not self.setting.places:
@@ -106,5 +134,21 @@ def _apart(points: Tensor, others: Tensor) -> Tensor:
 
 def _farther(points: Tensor, known: Tensor) -> Tensor:
     """Logarithm of the distance of each path to the nearest known one, relative to the mean of these ``(path,)``."""
-    among = _apart(known, known).fill_diagonal_(torch.inf).amin(dim=1).mean()
-    return _apart(points, known).amin(dim=1).clamp(min=1e-6).log() - among.clamp(min=LEAST).log()
+    return _apart(points, known).amin(dim=1).clamp(min=1e-6).log() - _usual(known).log()
+
+
+def _usual(known: Tensor) -> Tensor:
+    """Mean distance of known paths to the nearest other one, at least :data:`LEAST`."""
+    return _apart(known, known).fill_diagonal_(torch.inf).amin(dim=1).mean().clamp(min=LEAST)
+
+
+def _places(horizon: int) -> Tensor:
+    """Indices of the states that are points."""
+    return torch.linspace(0, horizon - 1, min(horizon, POINTS)).round().long()
+
+
+def _runs(path: Tensor, flags: Tensor) -> list[Tensor]:
+    """Parts of a path ``(horizon, state)`` whose points are flagged ``(point,)``, each with the points before and after it."""
+    states, last = path[_places(len(path))], len(flags) - 1
+    edges = (functional.pad(flags.int(), (1, 1)).diff()).nonzero().flatten().tolist()
+    return [states[max(0, begin - 1) : min(last, end) + 1] for begin, end in zip(edges[::2], edges[1::2], strict=True)]

@@ -52,6 +52,22 @@ def test_a_missing_part_is_seen_and_fresh_paths_are_whole(outline: Outline, kind
         assert whole.float().mean() <= 0.3
 
 
+def test_a_missing_part_and_what_stands_in_its_place_are_found(outline: Outline) -> None:
+    fresh, five = drawn("heart", 30, 9).states, drawn("heart", 5, 1)
+    cut = 3 * straight(fresh, 20, 34) + 50
+    whole = outline.whole(cut, {}, five)
+    assert whole is not None
+    middle, missing = cut[:, 27], 3 * fresh[:, 27] + 50  # of the line, and of the part that it replaces
+    apart = (middle - missing).norm(dim=1)
+    faults, near = outline.faults(cut, {}, five), []
+    for row in (~whole).nonzero().flatten().tolist():
+        points = torch.cat(faults[row])
+        near.append(min((points - place).norm(dim=1).min() for place in (middle[row], missing[row])) < apart[row])
+    assert len(near) >= 20
+    assert sum(near) >= 0.8 * len(near)
+    assert outline.faults(five.states, {}, five) == [[]] * 5
+
+
 def test_where_places_are_observed_a_path_is_compared_there() -> None:
     def walks(count: int, seed: int, share: float, text: str) -> Demonstrations:
         draw = np.random.default_rng(seed)
@@ -68,6 +84,10 @@ def test_where_places_are_observed_a_path_is_compared_there() -> None:
     wrong = outline.whole(fresh.states, elsewhere, five)
     assert wrong is not None
     assert wrong.float().mean() < 0.3
+    first = {"place": fresh.observed["place"][:1]}
+    (missing,) = outline.faults(fresh.states[:1] - elsewhere["place"][:1, None], first, five)
+    lost = torch.cat(missing)
+    assert (lost - 0.6 * fresh.observed["place"][0]).norm(dim=1).min() < 0.1  # at the place that is observed
 
 
 def test_a_single_demonstration_or_state_is_no_reason_to_fail(outline: Outline) -> None:

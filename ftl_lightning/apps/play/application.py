@@ -40,6 +40,7 @@ ANSWERS: Mapping[str, Handler] = {
     "remove": (requests.One, Workspace.remove),
     "undo": (requests.Nothing, Workspace.undo),
     "clear": (requests.Nothing, Workspace.clear),
+    "restore": (requests.Named, Workspace.restore),
     "sample": (requests.Sample, Workspace.sample),
 }
 """Type of the JSON body and handler of requests that are answered by the handler's result."""

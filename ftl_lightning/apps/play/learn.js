@@ -1,5 +1,5 @@
 // Steps 1 and 2: the demonstrations that are there, and learning a concept from them.
-const learning = { stop: null, again: null, concept: null, from: "", seconds: 0, more: "", samples: [], named: false, losses: [], unsaved: new Map() };
+const learning = { stop: null, again: null, concept: null, from: "", seconds: 0, more: "", samples: [], named: false, losses: [], ids: new Set(), unsaved: new Map() };
 const many = (count, one) => `${count} ${one}${count === 1 ? "" : "s"}`;
 const announce = (text) => { find("announced").textContent = text; };
 
@@ -7,11 +7,12 @@ const announce = (text) => { find("announced").textContent = text; };
 
 // Shows demonstrations. Where some were just added and there are enough, learning starts by itself.
 function worked(work, added = false) {
+  if (recorder.grown && JSON.stringify(work.demonstrations.map((one) => one.id)) !== learning.from) recorder.grown = null;
   state.work = work;
   if (!work.demonstrations.length) learning.task = "";
   slots();
   find("check").replaceChildren(...checks(work).map((text) => made("li", { textContent: text })));
-  find("undo").disabled = !work.undo;
+  undoable();
   find("clear").disabled = find("save-demos").disabled = !work.demonstrations.length;
   same("work", work.same);
   if (!learning.named) find("name").value = suggested();
@@ -104,9 +105,12 @@ const shownNow = () => JSON.stringify(state.work.demonstrations.map((one) => one
 const justLearned = () => Boolean(learning.concept && !learning.stop && learning.from === shownNow());
 
 function suggested() {
-  if (justLearned()) return learning.concept.name;
+  if (learning.concept && ongoing()) return learning.concept.name;
   return learning.task ? unused(learning.task) : unused(`my ${(state.recorder && KINDS[state.recorder.kind]) || "behaviour"} 1`);
 }
+
+// Whether some of what is there is what the last concept was learned from: learning again replaces this concept.
+const ongoing = () => state.work.demonstrations.some((one) => learning.ids.has(one.id));
 
 // A name that no concept has: numbers count up.
 function unused(name) {
@@ -127,7 +131,7 @@ function learnable() {
   const enough = count >= state.work.wanted, waiting = find("waiting");
   waiting.classList.toggle("warned", enough && !justLearned() && Boolean(doubt()));
   if (enough && !justLearned() && doubt()) waiting.textContent = doubt();
-  else if (learning.concept) waiting.textContent = learnedTold();
+  else if (learning.concept && (justLearned() || !count)) waiting.textContent = learnedTold();
   else if (enough) waiting.textContent = "Press Learn.";
   else waiting.textContent = `Learning starts by itself at demonstration ${state.work.wanted}${count >= 2 ? "; or press Learn now" : ""}.`;
 }
@@ -177,8 +181,9 @@ function learnInSight() {
 
 async function learn() {
   for (const one of [learning.stop, learning.again]) if (one) one.abort();
-  const name = unused((find("name").value.trim() || suggested()).replace(/\s+/g, " ")), stop = learning.stop = new AbortController();
-  Object.assign(learning, { concept: null, losses: [], from: shownNow() });
+  const wanted = (find("name").value.trim() || suggested()).replace(/\s+/g, " "), stop = learning.stop = new AbortController();
+  const former = state.concepts.find((one) => one.kind === "learned" && one.name === wanted), name = former ? wanted : unused(wanted);
+  Object.assign(learning, { concept: null, losses: [], from: shownNow(), ids: new Set(state.work.demonstrations.map((one) => one.id)) });
   find("name").value = name;
   document.body.dataset.learning = "yes";
   find("quality").textContent = "";
@@ -189,7 +194,7 @@ async function learn() {
   announce(`Learning ${name}.`);
   learnable();
   await attempt(async () => {
-    for await (const line of askLines("/api/learn", { name }, stop.signal)) {
+    for await (const line of askLines("/api/learn", { name, replaces: former ? former.id : "" }, stop.signal)) {
       if (stop.signal.aborted) return;
       if (line.error) throw new Error(line.error);
       if (line.loss !== undefined) lossTold(line);
@@ -205,6 +210,7 @@ async function learn() {
 }
 
 function samplesTold(samples, name) {
+  grow(samples);
   // The scale of the demonstrations, so that both can be compared.
   const view = viewOf([...state.work.demonstrations.map((one) => one.film), ...samples]);
   fill(find("samples"), samples, view, (number) => `Sample ${number + 1} of ${name}`);
@@ -238,7 +244,7 @@ function lossCurve(steps) {
 
 function learned(line) {
   Object.assign(learning, { named: false, seconds: line.seconds, more: line.more ? " It is being learned more thoroughly \u2026" : "" });
-  kept(line);
+  keptAnew(line);
   if (learning.losses.length) {
     const [last] = learning.losses.at(-1);
     lossCurve(last); // learning stops where little changes
@@ -262,6 +268,13 @@ function kept(line) {
   samplesTold(line.samples, line.concept.name);
 }
 
+// The same in the place of an earlier concept, whose film is another one.
+function keptAnew(line) {
+  kept(line);
+  noCard(cardKey(line.concept));
+  undoable();
+}
+
 // Learns a concept in the form that its demonstrations select, which takes longer; what is better replaces it.
 async function learnAgain(id) {
   const stop = learning.again = new AbortController();
@@ -282,8 +295,7 @@ function learnedAgain(line) {
   const took = `${line.seconds.toFixed(0)} seconds`;
   learning.more = line.concept ? ` Learned more thoroughly in ${took}.` : ` Learning more thoroughly for ${took} was not better.`;
   if (line.concept) {
-    kept(line);
-    noCard(cardKey(line.concept));
+    keptAnew(line);
     mixed();
   }
   learnable();
@@ -337,7 +349,26 @@ async function upload(file) {
   });
 }
 
-const undo = () => attempt(async () => worked(await ask("/api/undo", {})));
+// Undo brings back a concept that was just replaced; otherwise it undoes the last change of the demonstrations.
+const replaced = () => justLearned() && conceptOf(learning.concept.id).former;
+
+function undoable() {
+  find("undo").disabled = !state.work.undo && !replaced();
+  find("undo").title = `Ctrl+Z${replaced() ? `: brings back the former \u201c${learning.concept.name}\u201d` : ""}`;
+}
+
+const undo = () => attempt(async () => {
+  if (!replaced()) { worked(await ask("/api/undo", {})); return; }
+  if (learning.again) learning.again.abort();
+  const line = await ask("/api/restore", { id: learning.concept.id });
+  Object.assign(learning, { more: " The former one is back.", named: false });
+  find("progress").hidden = true;
+  keptAnew(line);
+  mixed();
+  find("name").value = suggested();
+  learnable();
+  announce(`The former ${line.concept.name} is back.`);
+});
 
 function listenToWork() {
   find("undo").addEventListener("click", undo);

@@ -2,8 +2,10 @@
 
 import functools
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -14,9 +16,9 @@ from ftl_lightning.data.features import InitialStates
 from ftl_lightning.data.outline import Outline
 from ftl_lightning.domains.domain import SUCCESS, Domain
 from ftl_lightning.domains.execution import Rollout
-from ftl_lightning.domains.films import VectorFilm
+from ftl_lightning.domains.films import VectorFilm, still
 from ftl_lightning.domains.from_file import FileSource
-from ftl_lightning.domains.pictures import Show, line_film
+from ftl_lightning.domains.pictures import WRONG, Show, line_film
 from ftl_lightning.evaluation.pictures import packed, packed_space
 from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.igm.composition import Composition
@@ -25,6 +27,8 @@ from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.quality import judging_domain, right_plans
 
 Json = dict[str, Any]
+Marks = Sequence[Sequence[Tensor]]  # wrong parts (point, 2) of each sample
+RED_LINE = 0.025  # width of the line of a wrong part, relative to the width of a film
 STEPS = 10  # maximum number of sampling steps, so that a moving slider is answered at once
 PARTS = "parts"  # name of the judgement that no part of a path is missing
 JOINED = " and "  # separator of the names of mixed concepts, for domains that read the result as a goal
@@ -67,27 +71,36 @@ def _outline(model: ConceptModel) -> Outline | None:
     return None if model.examples is None else Outline(model.examples, model.horizon, model.places)
 
 
-def _whole(model: ConceptModel, domain: Domain, plans: Demonstrations, goal: str) -> Tensor | None:
-    """Whether no part of each sample is missing or added ``(sample,)``; ``None`` for a shipped domain."""
+def _parts(model: ConceptModel, domain: Domain, plans: Demonstrations, goal: str) -> tuple[Tensor, Marks] | None:
+    """Whether no part of each sample is missing or added ``(sample,)``, and these parts if a film shows them: plans of two columns.
+    ``None`` for a shipped domain.
+    """
     outline = _outline(model)
     if outline is None:
         return None
     source = domain.source(None)
     assert isinstance(source, FileSource)
-    return outline.whole(plans.states, plans.initial_states.observed, source.demonstrations.select(goal))
+    compared = plans.states, plans.initial_states.observed, source.demonstrations.select(goal)
+    if (whole := outline.whole(*compared)) is None:
+        return None
+    shown = plans.states.shape[2] == 2 and bool(plans.states.isfinite().all())
+    parts = outline.faults(*compared) if shown else [[] for _ in range(len(plans))]
+    return whole, [[] if fine else part for fine, part in zip(whole.tolist(), parts, strict=True)]
 
 
 def judged(model: ConceptModel, domain: Domain, plans: Demonstrations, goal: str) -> tuple[list[Json], str]:
     """Films of samples, and the fraction of correct samples in words; empty without a goal, or if not judged. Samples of a user's
     data are also compared with the demonstrations part by part.
     """
-    success = right_plans(domain.measure(goal, plans.states, plans.initial_states)) if goal else None
-    if goal and (whole := _whole(model, domain, plans, goal)) is not None:
+    success, marks = right_plans(domain.measure(goal, plans.states, plans.initial_states)) if goal else None, None
+    if goal and (parts := _parts(model, domain, plans, goal)) is not None:
+        whole, marks = parts
         success = (PARTS, whole) if success is None else (f"{success[0]}, {PARTS}", success[1] & whole)
     if success is None:
         return films(domain, plans), ""
     name, right = success
-    return films(domain, plans, right.tolist()), f"{float(right.float().mean()):.0%} right ({name.replace('_', ' ')}: {goal})"
+    verdict = f"{float(right.float().mean()):.0%} right ({name.replace('_', ' ')}: {goal})"
+    return films(domain, plans, right.tolist(), marks), verdict
 
 
 def samples(
@@ -125,16 +138,22 @@ def film(drawn: VectorFilm, right: bool | None = None, outcome: str = "") -> Jso
     return {**shown, "right": right, "told": outcome}
 
 
-def plan_film(show: Show, states: Tensor, starts: InitialStates | None, right: bool | None = None) -> Json:
-    """Film of a plan or demonstration ``(time, state)``, with a single initial state in domains that have any."""
+def plan_film(
+    show: Show, states: Tensor, starts: InitialStates | None, right: bool | None = None, marks: Sequence[Tensor] = ()
+) -> Json:
+    """Film of a plan or demonstration ``(time, state)``, with a single initial state in domains that have any, and wrong parts
+    ``(point, 2)`` in the film's unit.
+    """
     if show.wireframe is not None:
         body = show.wireframe(states)
         return {"space": packed_space(body), "frames": len(body.points), "rate": body.rate, "right": right, "told": ""}
-    return film((show.vector_film or line_film)(states, starts), right)
+    drawn = (show.vector_film or line_film)(states, starts)
+    wrong = [still("line", part.numpy().astype(np.float32), WRONG, RED_LINE * drawn.window[2]) for part in marks]
+    return film(replace(drawn, shapes=(*drawn.shapes, *wrong)), right)
 
 
-def films(domain: Domain, plans: Demonstrations, right: Sequence[bool] | None = None) -> list[Json]:
-    """Films of all demonstrations or samples with finite states."""
+def films(domain: Domain, plans: Demonstrations, right: Sequence[bool] | None = None, marks: Marks | None = None) -> list[Json]:
+    """Films of all demonstrations or samples with finite states, with wrong parts."""
     starts, observed = plans.initial_states, bool(domain.observed)
     return [
         plan_film(
@@ -142,6 +161,7 @@ def films(domain: Domain, plans: Demonstrations, right: Sequence[bool] | None = 
             plans.states[row, :length],
             starts.take([row]) if observed else None,
             None if right is None else bool(right[row]),
+            marks[row] if marks else (),
         )
         for row, length in enumerate(plans.lengths.tolist())
         if plans.states[row].isfinite().all()

@@ -2,13 +2,13 @@
 const TAP = 8; // pixels: a shorter line was none
 const STEP = 1 / 30; // seconds between places of a path
 const recorder = { kind: "", scene: null, coming: null, queue: Promise.resolve(), at: [], shown: [], path: [], times: [], down: false,
-  held: null, keys: new Set(), penKeys: false, pen: null, pointer: null, passed: 0, last: 0, busy: 0 };
+  held: null, grown: null, keys: new Set(), penKeys: false, pen: null, pointer: null, passed: 0, last: 0, busy: 0 };
 
 const board = () => find("show");
 
 // Nothing is shown in until another model's scene is there.
 function noScene() {
-  Object.assign(recorder, { scene: null, path: [], times: [], shown: [], down: false, held: null, pointer: null, penKeys: false });
+  Object.assign(recorder, { scene: null, path: [], times: [], shown: [], grown: null, down: false, held: null, pointer: null, penKeys: false });
   recorder.keys.clear();
   board().getContext("2d").clearRect(0, 0, board().width, board().height);
   find("handles").replaceChildren();
@@ -30,7 +30,7 @@ function reset() {
   const scene = recorder.scene;
   Object.assign(recorder, { at: scene.pieces.map((piece) => [...piece.at]), path: [], times: [], down: false, held: null, pointer: null, passed: 0 });
   if (recorder.kind !== "draw") recorder.shown = [];
-  find("canvas").classList.toggle("flat", scene.film.window[3] < 0.7 * scene.film.window[2]); // what is beside it goes below
+  find("steps").style.setProperty("--wide", scene.film.window[2] / scene.film.window[3]);
   handles();
   told();
   redraw();
@@ -82,6 +82,7 @@ function redraw() {
   if (!recorder.scene) return;
   const film = recorder.scene.film, canvas = board();
   draw(canvas, film, 0, film.window, { moved: moved() });
+  if (recorder.grown) drawGrown(canvas);
   for (const line of recorder.shown) ink(canvas, line, 0.35);
   if (recorder.kind === "draw") ink(canvas, recorder.path.map((places) => places[0]), 1);
   if (recorder.kind === "steer") ink(canvas, recorder.path.map((places) => places[0]), 0.5);
@@ -89,10 +90,10 @@ function redraw() {
 }
 
 // A line as of ink: thin where it is fast, with round turns.
-function ink(canvas, line, alpha) {
+function ink(canvas, line, alpha, thin = 1) {
   const [left, lower, width] = recorder.scene.film.window, scale = canvas.width / width, pen = canvas.getContext("2d");
   const at = line.map(([x, y]) => [(x - left) * scale, canvas.height - (y - lower) * scale]);
-  const thick = Math.max(2, canvas.width / 70);
+  const thick = Math.max(2, thin * canvas.width / 70);
   let wide = thick;
   pen.globalAlpha = alpha;
   pen.strokeStyle = pen.fillStyle = "#1d4f91";
@@ -134,10 +135,11 @@ const NOUNS = { draw: "Stroke", arrange: "Arrangement", steer: "Trip" };
 
 function told() {
   const count = state.work.demonstrations.length, scene = recorder.scene;
-  const which = count < state.work.wanted ? `${NOUNS[recorder.kind]} ${count + 1} of ${state.work.wanted}` : `${count} are there; more are welcome`;
+  const first = count ? NOUNS[recorder.kind] : `Your turn: ${NOUNS[recorder.kind].toLowerCase()}`;
+  const which = count < state.work.wanted ? `${first} ${count + 1} of ${state.work.wanted}` : `${count} are there; more are welcome`;
   const limit = scene && scene.seconds ? ` of ${scene.seconds.toFixed(1)}` : "";
   const clock = recorder.kind === "steer" && recorder.passed ? ` \u00b7 ${recorder.passed.toFixed(1)}${limit} s` : "";
-  find("next").textContent = recorder.busy ? "One moment\u2026" : which + clock;
+  find("next").textContent = recorder.busy && recorder.kind !== "draw" ? "One moment\u2026" : which + clock;
   find("keep").disabled = recorder.kind === "steer" && recorder.path.length < 2;
 }
 
@@ -197,7 +199,7 @@ function pointerDown(event) {
   const place = placeOf(event);
   if (recorder.kind === "draw") {
     if (recorder.penKeys) penMode(false); // who presses on the canvas draws
-    Object.assign(recorder, { down: true, path: [[place]], times: [0], began: event.timeStamp });
+    Object.assign(recorder, { down: true, grown: null, path: [[place]], times: [0], began: event.timeStamp });
   } else if (recorder.kind === "arrange") {
     recorder.held = under(place);
     if (recorder.held === null) { hint("Press on a piece and drag it."); return; }
@@ -262,7 +264,7 @@ function keyDown(event) {
     event.preventDefault();
     if (event.repeat) return;
     if (recorder.down) { endStroke(); return; }
-    Object.assign(recorder, { down: true, path: [[[...recorder.pen]]], times: [0] });
+    Object.assign(recorder, { down: true, grown: null, path: [[[...recorder.pen]]], times: [0] });
     hint("The pen is down: arrow keys draw, space lifts it and keeps the stroke, Escape throws it away.");
     redraw();
   } else if (draws && key === "Escape" && recorder.down) {
@@ -416,7 +418,8 @@ const KEYS = {
 };
 
 async function setRecorder(found) {
-  find("stage").hidden = find("hand").hidden = find("next").hidden = !found;
+  find("canvas").hidden = !found;
+  find("steps").classList.toggle("bare", !found);
   find("ways").open = !found;
   recorder.kind = found ? found.kind : "";
   noScene();
@@ -433,6 +436,7 @@ async function setRecorder(found) {
   find("task-label").hidden = !found.tasks.length;
   find("task").replaceChildren(...found.tasks.map((name) => made("option", { value: name, textContent: name })));
   await attempt(newScene);
+  slots();
 }
 
 function canvasInSight() {

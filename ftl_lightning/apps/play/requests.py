@@ -86,11 +86,13 @@ class Nothing:
 @dataclass(frozen=True)
 class Learn:
     """Learn the concept ``name`` quickly from the current demonstrations, in the paper's form; or with ``again``, the identifier of
-    a concept that was learned so, from its demonstrations in the form that these select.
+    a concept that was learned so, from its demonstrations in the form that these select. ``replaces`` is the identifier of a
+    concept learned here that the new one replaces; empty for none.
     """
 
     name: str = ""
     again: str = ""
+    replaces: str = ""
 
     def __post_init__(self) -> None:
         if not self.again:

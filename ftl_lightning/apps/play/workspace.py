@@ -56,6 +56,7 @@ class Known:
         learned, demonstrations: how the concept was learned here, and from what; else ``None``.
         task: task of the demonstrations, if the library gave them; its initial states are sampled from.
         accuracy: fraction of correct samples; ``None`` if not judged.
+        former: concept that this one replaced; ``None`` for none.
     """
 
     name: str
@@ -67,11 +68,13 @@ class Known:
     demonstrations: Demonstrations | None = None
     task: str = ""
     accuracy: float | None = None
+    former: "Known | None" = None
 
     @property
     def content(self) -> Json:
         """Content for the page's list of concepts; the form is empty for training concepts."""
         content: Json = {"name": self.name, "kind": self.kind, "count": None, "form": "", "accuracy": self.accuracy}
+        content["former"] = self.former is not None
         if (concept := self.concept) is not None:
             content["count"] = concept.origin.count
             content["form"] = concept.choice.form if concept.choice else "modes" if concept.modes else "one set"
@@ -235,13 +238,14 @@ class Workspace:
             stopped: called after each step; whether no client waits.
 
         Raises:
-            UserError: if there are no demonstrations or they cannot be learned from.
+            UserError: if there are no demonstrations, they cannot be learned from, or the replaced concept was not learned here.
             Stopped: if no client waits, or the concept that is learned again has been removed.
         """
         if request.again:
             return self._learn_again(request.again, tell, stopped)
         name = " ".join(request.name.split())
         demonstrations, task, begin = self._demonstrating.together(name), self._demonstrating.task, monotonic()
+        former, how, _ = self._learned_here(request.replaces) if request.replaces else (None, None, None)
         changes, steps = self._settings(True)
         due, reported = begin + FIRST, begin
 
@@ -256,10 +260,22 @@ class Workspace:
 
         concept = self._invert(demonstrations, changes, steps, stopped, watch)
         self._count += 1
-        learned = self._newest = Learned(name, self._unused(name), changes, self._changed(steps))
-        known, found = self._measured(Known(name, "learned", concept, concept.concept, "", learned, demonstrations, task), concept)
+        label = how.label if how is not None and how.name == name else self._unused(name)
+        learned = self._newest = Learned(name, label, changes, self._changed(steps))
+        content = Known(name, "learned", concept, concept.concept, "", learned, demonstrations, task, former=former)
+        known, found = self._measured(content, concept)
         more = self._settings(False) != (changes, steps)
-        tell(self._keep(f"l{self._count}", known) | found | {"seconds": round(monotonic() - begin, 2), "more": more})
+        kept = self._keep(request.replaces or f"l{self._count}", known)
+        tell(kept | found | {"seconds": round(monotonic() - begin, 2), "more": more})
+
+    def restore(self, request: requests.Named) -> Json:
+        """Undo that a concept was learned again from other demonstrations: return the former one, its samples and their quality."""
+        former = self._known(request.id).former
+        if former is None or former.learned is None or not isinstance(former.composition, LearnedConcept):
+            raise UserError("id: expected a concept that replaced another one, found none; learn one again first")
+        self._newest = former.learned
+        known, found = self._measured(former, former.composition)
+        return self._keep(request.id, known) | found
 
     def _learn_again(self, key: str, tell: Tell, stopped: Callable[[], bool]) -> None:
         """Learn a concept in the form that its demonstrations select. It replaces the former concept unless this has the same form,
@@ -268,7 +284,9 @@ class Workspace:
         (_, _, demonstrations), begin = self._learned_here(key), monotonic()
         changes, steps = self._settings(False)
         concept = self._invert(demonstrations, changes, steps, lambda: stopped() or key not in self._concepts)
-        before, former, _ = self._learned_here(key)  # it may have been renamed meanwhile
+        before, former, learned_from = self._learned_here(key)  # it may have been renamed or replaced meanwhile
+        if learned_from is not demonstrations:
+            raise Stopped
         content = replace(concept.concept, origin=replace(concept.concept.origin, name=before.name))
         learned = replace(former, changes=changes, steps=self._changed(steps))
         known, found = self._measured(replace(before, composition=concept, concept=content, learned=learned), concept)

@@ -152,6 +152,22 @@ class Browser:
         """The keys that undo something."""
         ActionChains(self.driver).key_down(Keys.CONTROL).send_keys("z").key_up(Keys.CONTROL).perform()
 
+    def read_aloud(self) -> list[dict[str, str]]:
+        """Role and name of all that a screen reader reads, in its order."""
+        self.driver.execute_cdp_cmd("Accessibility.enable", {})
+        nodes = self.driver.execute_cdp_cmd("Accessibility.getFullAXTree", {})["nodes"]
+        by_id, found = {node["nodeId"]: node for node in nodes}, []
+
+        def visit(node: dict[str, Any]) -> None:
+            if not node.get("ignored"):
+                found.append({key: str(node.get(key, {}).get("value", "")) for key in ("role", "name")})
+            for child in node.get("childIds", []):
+                if child in by_id:
+                    visit(by_id[child])
+
+        visit(nodes[0])
+        return found
+
     def errors(self) -> list[str]:
         """What the browser complains of."""
         return [str(one["message"]) for one in self.driver.get_log("browser") if one["level"] == "SEVERE"]

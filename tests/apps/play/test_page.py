@@ -19,6 +19,7 @@ from tests.apps.play.served import Served, here
 
 pytestmark = [pytest.mark.browser, pytest.mark.usefixtures("learns_fast")]
 
+CONTROLS = ("button", "slider", "combobox", "textbox", "searchbox", "checkbox", "switch", "image", "img")
 PLACES = {0: (0.8, 4.5), 1: (1.5, 1.5), 2: (3.8, 3.8)}
 """Where circle, triangle and square are put: the square diagonal to the triangle."""
 NAMELESS = """[...document.querySelectorAll('button, input, select, canvas[role=img], a')]
@@ -107,6 +108,40 @@ def test_a_concept_is_learned_more_thoroughly_by_itself(page: Browser, monkeypat
     assert "one set" not in page.js("conceptOf(learning.concept.id).form")
     page.until(lambda: "form='auto'" in page.text("python"))
     assert not page.errors()
+
+
+def test_a_concept_learned_again_replaces_the_former_and_undo_brings_it_back(page: Browser) -> None:
+    page.js("(document.getElementById('ways').open = true)")
+    page.click("draw")
+    learned(page)
+    page.until(lambda: page.js("!learning.again"))
+    count, key = page.js("state.concepts.length"), page.js("learning.concept.id")
+    page.js("(document.querySelector('#slots .remove').click(), 1)")
+    page.until(lambda: page.count("#slots canvas") == 4)
+    page.click("learn")
+    page.until(lambda: page.js("justLearned() && learning.concept.count === 4"))
+    assert page.js("[state.concepts.length, learning.concept.id]") == [count, key]
+    page.undo()
+    page.until(lambda: "former one is back" in page.text("waiting"))
+    assert page.js("conceptOf(arguments[0]).count", key) == 5
+    page.undo()  # then the demonstration that was removed
+    page.until(lambda: page.count("#slots canvas") == 5)
+    assert not page.errors()
+
+
+def test_a_screen_reader_reads_it_through(page: Browser) -> None:
+    page.js("(document.getElementById('ways').open = true)")
+    page.click("draw")
+    learned(page)
+    nodes = page.read_aloud()
+    for node in nodes:
+        assert node["name"] or node["role"] not in CONTROLS, node
+    said = [node["name"] for node in nodes if node["role"] in ("heading", *CONTROLS)]
+    order = [next(at for at, text in enumerate(said) if text.endswith(title)) for title in ("Show five", "Learn", "Mix")]
+    assert order == sorted(order)
+    assert {"main", "banner", "region", "status", "alert"} & {node["role"] for node in nodes} >= {"main", "banner", "region"}
+    assert any("Sample 1 of" in node["name"] and ("right" in node["name"] or "wrong" in node["name"]) for node in nodes)
+    assert len({node["name"] for node in nodes if node["role"] == "slider"}) == sum(node["role"] == "slider" for node in nodes)
 
 
 def test_a_slider_changes_the_samples(page: Browser) -> None:

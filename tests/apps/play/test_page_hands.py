@@ -54,7 +54,7 @@ def learned(page: Browser) -> None:
 def test_an_example_draws_itself_and_ends_when_somebody_draws(strokes: Browser) -> None:
     cleared(strokes)
     picture = "document.getElementById('show').toDataURL()"
-    strokes.until(lambda: strokes.text("next") == "Stroke 1 of 5")
+    strokes.until(lambda: strokes.text("next") == "Your turn: stroke 1 of 5")
     empty = strokes.js(picture)
     strokes.js("(playExample(), 1)")
     strokes.until(lambda: strokes.text("next") == "Five strokes")
@@ -67,8 +67,23 @@ def test_an_example_draws_itself_and_ends_when_somebody_draws(strokes: Browser) 
     cleared(strokes)
     strokes.js("(playExample(), 1)")
     strokes.until(lambda: strokes.text("next") == "Learned: samples")
-    strokes.until(lambda: strokes.text("next") == "Stroke 1 of 5")
+    strokes.until(lambda: strokes.text("next") == "Your turn: stroke 1 of 5")
     assert strokes.js(picture) == empty
+
+
+def test_samples_grow_out_of_the_strokes_until_somebody_draws(strokes: Browser) -> None:
+    cleared(strokes)
+    for number in range(5):
+        stroke(strokes, 0.1 + 0.02 * number)
+    learned(strokes)
+    strokes.until(lambda: strokes.js("performance.now() > recorder.grown.start + GROW"))
+    grown = strokes.js("[recorder.grown.strokes.length, shapesNow(recorder.grown)[0], lineOf(learning.samples[0])]")
+    assert grown[0] == 5
+    assert grown[1] == grown[2]
+    stroke(strokes)
+    assert strokes.js("recorder.grown === null || learning.stop !== null || justLearned()")
+    cleared(strokes)
+    assert strokes.js("recorder.grown") is None
 
 
 def test_the_first_stroke_moves_nothing(strokes: Browser) -> None:
@@ -169,7 +184,9 @@ def test_what_is_learned_is_mixed_forgotten_and_renamed(page: Browser) -> None:
     # Alone in the mix; a second one beside it, half and half.
     assert page.js(WEIGHTS) == [["my stroke 1", "1"]]
     assert page.js("document.querySelector('#concepts .pick .about').textContent").startswith("5 demonstrations · ")
-    page.click("learn")  # again, from the same
+    page.js("(find('name').value = '', find('name').focus())")
+    page.press("my stroke 2")
+    page.click("learn")  # again from the same, with another name
     page.until(lambda: page.js("justLearned() && learning.concept.name === 'my stroke 2'"))
     assert page.js(WEIGHTS) == [["my stroke 1", "0.5"], ["my stroke 2", "0.5"]]
     assert page.js("find('name').value") == "my stroke 2"

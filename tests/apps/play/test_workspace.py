@@ -180,6 +180,26 @@ def test_learning_again_replaces_what_is_not_better(
         assert "form='auto'" in after.work()["same"]["python"]
 
 
+def test_a_concept_learned_again_replaces_the_former_which_comes_back(
+    after: Workspace, key: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Workspace, "_settings", quickly)
+    before, former = after.state()["concepts"], after.concept_file(key)
+    told: list[Json] = []
+    after.draw(requests.Drawn("circle right of square", 2))
+    after.learn(requests.Learn(TASK, replaces=key), told.append, lambda: False)
+    assert told[-1]["concept"]["id"] == key
+    assert told[-1]["concept"]["former"]
+    assert len(after.state()["concepts"]) == len(before)
+    assert after.concept_file(key)[0] == former[0]
+    assert after.concept_file(key)[1] != former[1]
+    back = after.restore(requests.Named(key))
+    assert back["concepts"] == before
+    assert after.concept_file(key) == former
+    with pytest.raises(UserError, match="expected a concept that replaced another one"):
+        after.restore(requests.Named(key))
+
+
 def test_learning_again_in_the_same_form_changes_nothing(after: Workspace, key: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Workspace, "_settings", lambda self, quick: ({"form": PAPER}, 5))
     known = after._concepts[key]
