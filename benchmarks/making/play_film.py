@@ -26,9 +26,9 @@ from tests.apps.play.browser import Browser, browser
 from tests.apps.play.served import served
 
 KIND, SEED, OTHER = "heart", 5, "wave"
-WINDOW, WIDTH = (1180, 1130), 760
+WINDOW, WIDTH = (1180, 800), 760
 """Of the browser, in pixels, and of the film."""
-RATE, COLOURS = 8.0, 48
+RATE, COLOURS = 8.0, 96
 
 
 class Film:
@@ -92,7 +92,11 @@ def record(page: Browser, film: Film) -> None:
     page.until(lambda: page.data("learning") == "yes")
     while page.data("learning") == "yes":
         film.take()
-    film.take(8)
+    for _ in range(12):  # samples grow
+        film.take()
+        time.sleep(0.05)
+    page.until(lambda: page.data("again") == "no")
+    film.take(6)
     page.js("(document.getElementById('mix-title').scrollIntoView(), 1)")
     time.sleep(0.5)
     page.js(f"([...document.querySelectorAll('.pick')].find((one) => one.textContent.includes('{OTHER}')).click(), 1)")

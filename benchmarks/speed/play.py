@@ -34,6 +34,28 @@ MOVES = 6
 """Of a slider."""
 
 
+TICKED = """learning.samples.filter((film) => film.right).map((film) => {
+  const shape = film.shapes.find((one) => one.kind === "way");
+  return Array.from({ length: film.frames }, (_, frame) => placed(shape, film, frame)[0]);
+})"""
+"""Lines of the samples that the page ticks as right."""
+
+
+def first_movement(page: Browser, address: str) -> float:
+    """Seconds from the request of the page to the first line that draws itself on the canvas."""
+    begin = time.monotonic()
+    page.open(address)
+    page.until(lambda: page.text("next") == "Five strokes")
+    return time.monotonic() - begin
+
+
+def ticked(page: Browser, judge: Judge, kind: str) -> list[bool]:
+    """Whether each sample that the page ticks as right is of another kind."""
+    if not (lines := page.js(TICKED)):
+        return []
+    return [predicted != kind for predicted in judge.kind(np.array(lines, dtype=np.float32))]
+
+
 def learn(page: Browser, server: Served, kind: str) -> tuple[dict[str, float], bytes]:
     """Draw five strokes of a kind; returns seconds from the end of the last one, and the concept's file."""
     page.click("clear")
@@ -101,17 +123,19 @@ def main() -> None:
         begin = time.monotonic()
         with served(folder, ["--pretrained", "strokes"]) as server, browser(folder) as page:
             started = time.monotonic()
-            page.open(server.address)
+            moved = first_movement(page, server.address)
             page.until(lambda: int(page.data("samples") or 0) > 0)
             opened = server.seconds + time.monotonic() - started
             for kind in options.kinds:
                 seconds, content = learn(page, server, kind)
+                wrong = ticked(page, judge, kind)
                 path = folder / "concept.safetensors"
                 path.write_bytes(content)
                 samples = model.sample(model.load(path), SAMPLES, seed=SEED).states.numpy()
                 told = {key: round(value, 2) for key, value in seconds.items()}
                 told |= {"recognised": judge.rate(samples, kind), "loss": round(Concept.load(path).origin.loss, 4)}
                 told["recognised, as drawn"] = judge.rate(drawn(kind, SAMPLES, SEED + 1), kind)
+                told |= {"ticked": len(wrong), "wrong ticked": sum(wrong)}
                 told["slider"] = round(statistics.median(slide(page)), 2)
                 rows[kind] = told
                 print(kind, told, flush=True)
@@ -120,6 +144,7 @@ def main() -> None:
         "model": model.model.hash,
         "machine": {"processor": platform.machine(), "python": platform.python_version()},
         "seconds from the command to samples on the page": round(opened, 2),
+        "seconds from the request of the page to the first movement": round(moved, 2),
         "kinds": rows,
         "validation": _means([rows[kind] for kind in VALIDATION if kind in rows]),
         "test": _means([rows[kind] for kind in TEST if kind in rows]),
@@ -136,6 +161,8 @@ def _means(rows: list[dict[str, float]]) -> dict[str, float]:
     rates = np.array([row["recognised"] for row in rows])
     found = {"recognised": round(float(rates.mean()), 3), "least": round(float(rates.min()), 3)}
     found["standard error"] = round(float(rates.std(ddof=1) / len(rates) ** 0.5), 3) if len(rates) > 1 else 0.0
+    for key in ("ticked", "wrong ticked"):
+        found[key] = sum(row[key] for row in rows)
     for key in ("first samples", "learned", "slider"):
         found[f"{key}, seconds"] = round(statistics.median(row[key] for row in rows), 2)
     return found
@@ -144,16 +171,18 @@ def _means(rows: list[dict[str, float]]) -> dict[str, float]:
 def _table(whole: dict[str, Any]) -> str:
     """The same as Markdown."""
     keys = ("first samples", "learned", "slider")
-    lines = ["| | recognised (least) | first samples | learned | slider |", "|---|---|---|---|---|"]
+    lines = ["| | recognised (least) | ticked, of these wrong | first samples | learned | slider |", "|---|---|---|---|---|---|"]
     for name in ("validation", "test"):
         if found := whole[name]:
             rate = f"{found['recognised']:.2f} ± {found['standard error']:.2f} ({found['least']:.2f})"
             cells = [f"{found[f'{key}, seconds']:.1f} s" for key in keys]
             count = sum(kind in whole["kinds"] for kind in (VALIDATION if name == "validation" else TEST))
-            lines.append(f"| {count} {name} kinds | {rate} | {' | '.join(cells)} |")
+            ticks = f"{found['ticked']}, {found['wrong ticked']}"
+            lines.append(f"| {count} {name} kinds | {rate} | {ticks} | {' | '.join(cells)} |")
     opened = whole["seconds from the command to samples on the page"]
     told = "Mean ± standard error over kinds. Seconds are medians: from the end of the fifth stroke, and from the move of a slider "
-    told += f"to new samples. From the command to the first samples on the page: {opened:.1f} s."
+    told += f"to new samples. From the command to the first samples on the page: {opened:.1f} s; from the request of the page to "
+    told += f"the first movement: {whole['seconds from the request of the page to the first movement']:.1f} s."
     return "\n".join((*lines, "", told, ""))
 
 

@@ -28,7 +28,7 @@ from ftl_lightning.training.quality import judging_domain, right_plans
 
 Json = dict[str, Any]
 Marks = Sequence[Sequence[Tensor]]  # wrong parts (point, 2) of each sample
-RED_LINE = 0.025  # width of the line of a wrong part, relative to the width of a film
+RED_LINE = 0.04  # width of the line of a wrong part, relative to the width of a film
 STEPS = 10  # maximum number of sampling steps, so that a moving slider is answered at once
 PARTS = "parts"  # name of the judgement that no part of a path is missing
 JOINED = " and "  # separator of the names of mixed concepts, for domains that read the result as a goal
