@@ -55,11 +55,13 @@ class VectorFilm:
         shapes: shapes in drawing order; moving shapes have the same number of frames.
         window: visible window: left edge, lower edge, width and height, in the film's unit.
         rate: frames per second. Points are interpolated linearly between frames.
+        scale: minimum pixels per unit on the page of ``play``, which then follows the last shape; 0 shows the whole window.
     """
 
     shapes: Sequence[Shape]
     window: tuple[float, float, float, float]
     rate: float
+    scale: float = 0.0
 
     @property
     def frames(self) -> int:

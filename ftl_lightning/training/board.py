@@ -14,9 +14,8 @@ from torch.optim import Optimizer
 
 from ftl_lightning.services.progress import Advance, bar
 
-PICTURES, FILMS, ROLLOUTS = "pictures", "plans in motion", "rollouts"
-"""Groups of pictures of plans, films of plans and films of episodes. TensorBoard sorts groups by name; these follow ``accuracy``,
-``loss`` and ``optimizer``."""
+PICTURES, FILMS, ROLLOUTS = "1 pictures", "2 plans in motion", "3 rollouts"
+"""Groups of pictures of plans, films of plans and films of episodes. TensorBoard sorts groups by name: these precede curves."""
 RESULTS = "test results"
 """Group of test results, a single point each."""
 

@@ -52,9 +52,9 @@ def test_invert_judges_plans_and_executes_them(invert: list[str], monkeypatch: p
     assert oracle.loc[oracle["metric"] == "closed loop success", "value"].mean() > 0.9
     events = EventAccumulator("logs/agent/invert", size_guidance={"images": 0})
     events.Reload()
-    tag = "rollouts/new initial state/go to red bowl"
+    tag = "3 rollouts/new initial state/go to red bowl"
     assert events.Images(tag)[0].encoded_image_string.startswith(b"GIF89a")
-    assert "pictures/new initial state/go to red bowl" in events.Tags()["images"]
+    assert "1 pictures/new initial state/go to red bowl" in events.Tags()["images"]
     assert "test results/closed loop success/new initial state" in events.Tags()["scalars"]
 
 

@@ -61,4 +61,4 @@ def test_concepts_are_learned_judged_and_filmed_from_a_folder(config: str, tiny_
     assert {"accuracy", "rise", "bone error", "jerk"} < set(rows["metric"])
     assert set(rows["setting"]) == {"new concept", "new concept, demonstrated poses"}
     events = EventAccumulator("logs/mocap/invert", size_guidance={"images": 0}).Reload()
-    assert "plans in motion/new concept/knee raise" in events.Tags()["images"]
+    assert "2 plans in motion/new concept/knee raise" in events.Tags()["images"]

@@ -246,7 +246,7 @@ def test_tensorboard_gets_scalars_figures_hparams_and_projector(log: Path, tiny:
     assert len(events.Scalars("loss/train")) == 5
     for setting in ("training concept", "training composition", "new concept", "new + training"):
         assert 0 <= events.Scalars(f"test results/accuracy/{setting}")[0].value <= 1
-    image = events.Images("pictures/new concept/square diagonal to triangle")[0]
+    image = events.Images("1 pictures/new concept/square diagonal to triangle")[0]
     assert image.encoded_image_string.startswith(b"\x89PNG")
     labels = [row.split("\t") for row in next(log.rglob("metadata.tsv")).read_text().splitlines()]
     assert labels[0] == ["text", "set", "component", "part"]

@@ -62,7 +62,7 @@ def test_a_test_adds_tables_and_its_means_behind_everything_else(tmp_path: Path)
     rows = [row("here", "new", task, "accuracy", value) for task, value in (("a", 0.25), ("b", 0.75))]
     rows += [row("here", "new", "a", "accuracy", 0.1, method="random", **REFERENCE)]
     log_test(own, {}, rows, 5)
-    log_animation(own, "rollouts/new/a", [np.zeros((20, 60, 3), dtype=np.uint8)] * 2, 5)
+    log_animation(own, "3 rollouts/new/a", [np.zeros((20, 60, 3), dtype=np.uint8)] * 2, 5)
     own.experiment.close()
     events = EventAccumulator(str(tmp_path / "here" / "invert")).Reload()
     assert events.Tags()["scalars"] == ["test results/accuracy/new"]
@@ -73,7 +73,7 @@ def test_a_test_adds_tables_and_its_means_behind_everything_else(tmp_path: Path)
     assert "a (new)" in tasks
     assert "0.75" in tasks
     assert "- random" in tasks
-    image = events.Images("rollouts/new/a")[0]
+    image = events.Images("3 rollouts/new/a")[0]
     assert image.encoded_image_string.startswith(b"GIF89a")
     assert (image.height, image.width) == (20, 60)
 

@@ -62,7 +62,7 @@ def test_the_server_answers(get: Callable[..., bytes]) -> None:
     curve = json.loads(get(f"plugin/scalars/scalars?run={quoted}&tag=loss%2Ftrain"))
     assert len(curve) == 5
     images = json.loads(get("plugin/images/tags"))
-    tag = "pictures/new concept/square diagonal to triangle"
+    tag = "1 pictures/new concept/square diagonal to triangle"
     assert tag in images[run]
     entry = json.loads(get(f"plugin/images/images?run={quoted}&tag={urllib.parse.quote(tag, safe='')}&sample=0"))[0]
     assert get(f"plugin/images/individualImage?{entry['query']}").startswith(b"\x89PNG")

@@ -135,7 +135,7 @@ def film(drawn: VectorFilm, right: bool | None = None, outcome: str = "") -> Jso
     """Film of shapes; ``right`` is ``None`` if not judged."""
     window = [round(edge, 4) for edge in drawn.window]
     shown = {"frames": drawn.frames, "rate": round(drawn.rate, 3), "window": window, "shapes": packed(drawn)}
-    return {**shown, "right": right, "told": outcome}
+    return {**shown, "scale": drawn.scale, "right": right, "told": outcome}
 
 
 def plan_film(

@@ -109,4 +109,16 @@ function steadyView(before, films) {
   return within && now[2] > 0.6 * before[2] && now[3] > 0.6 * before[3] ? before : now;
 }
 
-const drawFilm = (canvas, film, at, view, how) => film.space ? drawBody(canvas, film, at, view, how) : draw(canvas, film, at, view, how);
+// A part of a view around the last shape of a film, if the whole were drawn too small.
+function closer(canvas, film, at, view) {
+  const wide = canvas.clientWidth / (film.scale || 1);
+  const places = film.scale && wide < view[2] && placed(film.shapes.at(-1), film, Math.min(at * film.rate, film.frames - 1));
+  if (!places) return view;
+  const [x, y] = [0, 1].map((axis) => places.reduce((sum, place) => sum + place[axis], 0) / places.length), high = wide * view[3] / view[2];
+  return [x - wide / 2, y - high / 2, wide, high];
+}
+
+function drawFilm(canvas, film, at, view, how) {
+  if (film.space) drawBody(canvas, film, at, view, how);
+  else draw(canvas, film, at, how.over || how.alpha < 1 ? view : closer(canvas, film, at, view), how);
+}

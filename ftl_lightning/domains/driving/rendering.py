@@ -156,6 +156,7 @@ def _between(before: NDArray[np.float32], after: NDArray[np.float32], part: floa
 
 PLAYED, FAR = 2.0, 100.0
 """Playback speed of vector films, and metres of road around moving objects in them; a page shows a part of it."""
+PIXELS = 20.0  # of the length of a vehicle
 SAME = 12.0  # metres at most from the predicted position to match a vehicle
 
 
@@ -188,7 +189,8 @@ def _from_above(name: str, others: Sequence[Shape], ego: NDArray[np.float32]) ->
     roads = [still("line", lane, colour, size) for colour, size in ((ROAD, LANE), (MARK, 0.3)) for lane in lanes]
     way = Shape("way", (ego[:, None, 1:3] * (1, -1)).astype(np.float32), EGO, 0.6)
     window = (float(low[0]), float(-high[1]), float(high[0] - low[0]), float(high[1] - low[1]))
-    return VectorFilm((*roads, way, *others, Shape("area", _corners(ego), EGO)), window, PLAYED / decision_seconds(name))
+    shapes = (*roads, way, *others, Shape("area", _corners(ego), EGO))
+    return VectorFilm(shapes, window, PLAYED / decision_seconds(name), PIXELS / LENGTH)
 
 
 def _corners(seen: NDArray[np.float32]) -> NDArray[np.float32]:
