@@ -29,6 +29,7 @@ from ftl_lightning.services.text import counted, say
 from ftl_lightning.services.validation import check_range
 from ftl_lightning.training.board import TrainingBar, accuracies
 from ftl_lightning.training.checkpoint import last_checkpoint, read_checkpoint
+from ftl_lightning.training.model_folder import sampling_command
 from ftl_lightning.training.trainer import Trainer, one_voice
 
 NAMED = 3
@@ -148,7 +149,9 @@ class CommandLine(LightningCLI):
         say(f"model: {self.model.hparams['pretrained']} ({counted(len(concepts), 'training concept')}: {some})")
 
     def after_invert(self) -> None:
-        """Print the log folder."""
+        """Print how to sample the first concept, and the log folder."""
+        name, path = next(iter(self.model.files.items()))
+        say(f"to sample: {sampling_command(self.model.hparams['pretrained'], name, path, self.model.domain)}")
         say(f"logged in {self.trainer.log_dir or self.trainer.default_root_dir}")
 
     def before_validate(self) -> None:

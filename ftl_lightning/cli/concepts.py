@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 MOST_SAMPLES, MOST_DRAWN = 10_000, 1000
 """Maximum number of samples of a command, which are one batch, and of samples in a figure."""
+MOST_PARTS = 16  # maximum number of embeddings that are explained
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,7 @@ def invert(options: InvertOptions) -> None:
     from ftl_lightning.domains.from_file import read_own
     from ftl_lightning.few_shot.learner import FewShot
     from ftl_lightning.igm.library import concept_files, write_concept
+    from ftl_lightning.training.model_folder import sampling_command
 
     model = FewShot.from_pretrained(options.pretrained, options.settings or None)
     demos = read_own(options.demonstrations)
@@ -73,6 +75,7 @@ def invert(options: InvertOptions) -> None:
         with waiting(f"{name}: quality of samples"):
             quality = learned[name].inspection
         write_concept(learned[name].concept, path, quality)
+    say(f"to sample: {sampling_command(options.pretrained, *next(iter(files.items())), model.domain)}")
 
 
 @dataclass(frozen=True)
@@ -96,6 +99,7 @@ class SampleOptions:
         initial: demonstrations file with initial states to use instead; one sample for each.
         out: demonstrations file to write, as for generate.
         figure: picture to write, .png or .svg.
+        demonstrations: file of demonstrations to draw above the samples in this picture.
         execute: also execute the concept in closed loop from the same initial states, in domains with an environment, and print
             outcomes.
         replan: steps between plans; 1 in the paper; 0 for that of the settings.
@@ -117,6 +121,7 @@ class SampleOptions:
     initial: str = ""
     out: str = "states.safetensors"
     figure: str = ""
+    demonstrations: str = ""
     execute: bool = False
     replan: int = 0
     animation: str = ""
@@ -140,6 +145,7 @@ def sample(options: SampleOptions) -> None:
     """Generate behaviour as in ``options``; write, judge, draw and execute it."""
     with waiting("loading"):
         from ftl_lightning.data.demonstrations import writer
+        from ftl_lightning.domains.from_file import read_own
         from ftl_lightning.evaluation.pictures import captioned, gif
         from ftl_lightning.few_shot.learner import FewShot
         from ftl_lightning.services.tensor_file import atomic, write_text
@@ -147,6 +153,7 @@ def sample(options: SampleOptions) -> None:
 
         writer(options.out)  # refuses a format before the work
         model = FewShot.from_pretrained(options.pretrained, options.settings or None)
+    compared = model.demonstrations(read_own(options.demonstrations)) if options.demonstrations else None
     text = " + ".join(part for part in (options.compose, options.concept) if part)
     known = model.compose(text) if text else None  # unknown concepts are reported before missing ones
     _check_sample(options, model.domain)
@@ -158,7 +165,7 @@ def sample(options: SampleOptions) -> None:
         count = options.count if starts is None else None
         plans = model.sample(composition, count, starts, seed=options.seed, **_sampling(options))
     provenance = {**plans.provenance, "concept": options.concept, "compose": options.compose}
-    plans = replace(plans, concepts=(goal,) * len(plans), provenance=provenance)
+    plans = replace(plans, concepts=(goal or _named(options),) * len(plans), provenance=provenance)
     plans.save(options.out)
     # Without a configuration of the domain, the settings of invert must be given again.
     say(f"{options.out}: {len(plans)} samples; settings of {model.settings}")
@@ -169,7 +176,7 @@ def sample(options: SampleOptions) -> None:
         say(f"{name} on '{goal}': {value:.2f}{f' ({calibration})' if calibration else ''}")
     if options.figure:
         with atomic(options.figure) as temporary:
-            model.render(plans, goal).savefig(temporary, dpi=110)
+            model.render(plans, goal, compared).savefig(temporary, dpi=110)
         say(options.figure)
     for path, states in zip(exported, plans.states, strict=False):
         write_text(path, model.domain.show.exports[path.suffix](states))
@@ -183,9 +190,17 @@ def sample(options: SampleOptions) -> None:
             done.save(options.animation)
     elif options.animation and film:
         with atomic(options.animation) as temporary:
-            temporary.write_bytes(gif(captioned(film(plans.states[0]), goal or Path(options.concept).stem)))
+            temporary.write_bytes(gif(captioned(film(plans.states[0]), plans.concepts[0])))
     if options.animation:
         say(options.animation)
+
+
+def _named(options: SampleOptions) -> str:
+    """Text of the samples: the composed texts and the name of the learned concept."""
+    from ftl_lightning.igm.concept import Concept
+
+    learned = Concept.load(options.concept).origin.name if options.concept else ""
+    return " + ".join(filter(None, (options.compose, learned)))
 
 
 def _sampling(options: SampleOptions) -> dict[str, Any]:
@@ -330,5 +345,7 @@ def explain(concept: str, pretrained: str = "", nearest: int = 3) -> None:
     if len(learned.weights) > 1:
         whole = learned.at_knots(learned.weighted_sum)
         parts += [(f"weighted sum{knot}", embedding) for knot, embedding in whole.items()]
-    for name, embedding in parts:
+    for name, embedding in parts[:MOST_PARTS]:
         say(f"{name}: {explained(embedding, names, model.training_embeddings, nearest)}")
+    if rest := len(parts) - MOST_PARTS:
+        say(f"{rest} more embeddings, of other knots, modes and components") if rest > 0 else None

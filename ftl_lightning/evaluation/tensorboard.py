@@ -18,9 +18,7 @@ from tensorboard.compat.proto.summary_pb2 import Summary
 from torch.utils.tensorboard.summary import hparams, scalar
 from torch.utils.tensorboard.writer import FileWriter
 
-from ftl_lightning.data.places import first_windows
 from ftl_lightning.domains.domain import Domain
-from ftl_lightning.domains.pictures import Drawn, beside
 from ftl_lightning.evaluation.generation import TaskResult, share
 from ftl_lightning.evaluation.pictures import captioned, gif, outcome_text
 from ftl_lightning.evaluation.results import Row
@@ -28,6 +26,7 @@ from ftl_lightning.evaluation.summary import own_rows, plain, summary_table
 from ftl_lightning.igm.concept import Part, Point
 from ftl_lightning.services.text import line
 from ftl_lightning.training.board import FILMS, PICTURES, RESULTS, ROLLOUTS
+from ftl_lightning.training.quality import drawn
 
 if TYPE_CHECKING:  # slow import
     from matplotlib.figure import Figure
@@ -69,18 +68,7 @@ def picture(behaviour: TaskResult, domain: Domain, figures: int) -> "Figure":
     shown = slice(0, figures)
     starts = None if behaviour.starts is None else behaviour.starts.take(shown)
     right = None if behaviour.right is None else behaviour.right[shown].tolist()
-    states, demonstrations = behaviour.states[shown], behaviour.demonstrations
-    if demonstrations is None:
-        return domain.show.picture(states, right, title(behaviour), starts)
-    windows, first = first_windows(demonstrations, states.shape[1]), demonstrations.initial_states
-    above = f"demonstrations: {', '.join(behaviour.task.learned)}"
-    below = "samples" if right is None else f"samples: {sum(right)} right (green), {right.count(False)} wrong (red)"
-    return beside(
-        domain.show,
-        Drawn(above, windows[shown], first.take(shown) if domain.observed else None),
-        Drawn(below, states, starts, right),
-        title(behaviour),
-    )
+    return drawn(domain, behaviour.states[shown], starts, right, title(behaviour), behaviour.demonstrations)
 
 
 def log_animation(logger: TensorBoardLogger, tag: str, frames: Sequence[NDArray[np.uint8]], step: int) -> None:

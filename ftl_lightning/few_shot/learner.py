@@ -506,10 +506,14 @@ class FewShot(Shown):
         return judging_domain(self.model, self._examples)
 
     @usual_modes()
-    def render(self, plans: Demonstrations, goal: str = "") -> "Figure":
-        """Draw plans; with a goal, right plans are framed green and wrong plans red."""
+    def render(self, plans: Demonstrations, goal: str = "", demonstrations: Demonstrations | None = None) -> "Figure":
+        """Draw plans, below ``demonstrations`` if given; with a goal, right plans are framed green and wrong plans red.
+
+        Raises:
+            UserError: for plans of another domain, or a goal that the domain cannot judge.
+        """
         check_of_domain("render", plans, self.domain)
-        return picture(self.judging, plans, goal)
+        return picture(self.judging, plans, goal, demonstrations)
 
     @usual_modes()
     def execute(

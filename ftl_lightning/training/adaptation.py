@@ -124,7 +124,7 @@ class Adaptation(pl.LightningModule, ABC):
         if len(set(names)) > 1 and (OWN in names or load_domain(data.domain_name) is not self.model.domain):
             raise UserError(f"data.domain: expected {trained!r} (the pretrained model's), found {data.domain_name!r}")
         self.concepts = data.concepts
-        self._files = concept_files(self.concepts, self.folder, "concepts")
+        self.files = concept_files(self.concepts, self.folder, "concepts")
         self._learned = {}
         try:
             self.demonstrations: Demonstrations = self.domain.fitted(data.demonstrations)
@@ -171,7 +171,7 @@ class Adaptation(pl.LightningModule, ABC):
         """Learn the concepts and write each to a file."""
         log_folder.keep()  # also without training
         for name, concept in self.learned().items():
-            write_concept(concept, self._files[name], self._quality(name, concept) if self._of_user else None)
+            write_concept(concept, self.files[name], self._quality(name, concept) if self._of_user else None)
 
     def _quality(self, name: str, concept: Concept) -> Inspection | None:
         """Quality of the samples of a user's concept, or ``None`` if it cannot be measured; TensorBoard has quality and skills."""

@@ -20,10 +20,12 @@ from ftl_lightning.igm.forms.combination import Combination
 from ftl_lightning.igm.forms.leave_one_out import LeaveOneOut, find_outlier, leave_one_out, relative_losses
 from ftl_lightning.igm.inversion import Tell
 from ftl_lightning.igm.settings import AUTO, InversionSettings
-from ftl_lightning.services.errors import about, require, short
+from ftl_lightning.services.errors import UserError, about, short
 from ftl_lightning.services.progress import bar
+from ftl_lightning.services.shipped import MODELS
 from ftl_lightning.services.text import alike, counted
 from ftl_lightning.training.concept_model import ConceptModel
+from ftl_lightning.training.model_folder import find_model
 
 MARGIN, MOST_OF = 0.97, 0.8
 """Maximum loss, relative to the unconditional loss, of a demonstration that a training concept explains; minimum
@@ -309,11 +311,21 @@ def _range_finding(what: str, values: Tensor, names: "list[str] | tuple[str, ...
     yield Finding(message, "warning" if share > MANY or most > OUTSIDE else "note")
 
 
+def _model_of(model_hash: str) -> str:
+    """Where a concept's model is, or what to do."""
+    try:
+        return f"its model is {find_model(model_hash, (Path('pretrained'), Path('logs'), MODELS))}"
+    except UserError:
+        return "give its own model, or learn it again"
+
+
 def check_concept(model: ConceptModel, concept: Concept, path: str | Path) -> None:
     """Refuse a learned concept of another model; ``UserError`` if encoder, domain, pretrained model or sizes differ."""
     of_model = {"encoder": model.config.encoder, "domain": model.config.domain, "pretrained": model.hash}
     for key, expected in of_model.items():
         value, wanted = getattr(concept.origin, key), f"{expected!r} (the pretrained model's)"
-        require(value == expected, f"{path}: key {key!r}", wanted, f"{short(value)!r}; give its own model, or learn it again")
+        if value != expected:
+            advice = _model_of(concept.origin.pretrained)
+            raise UserError(f"{path}: key {key!r}: expected {wanted}, found {short(value)!r}; {advice}")
     with about(path):
         model.check_sizes(concept)

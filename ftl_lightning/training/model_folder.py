@@ -1,6 +1,7 @@
 """Folder of a pretrained model: ``config.json``, ``model.safetensors``, and examples of a user's data."""
 
 import json
+import shlex
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -196,3 +197,11 @@ def find_model(model_hash: str, places: Sequence[Path]) -> Path:
         searched = ", ".join(map(str, places))
         raise UserError(f"pretrained: expected the model with the hash {model_hash} below {searched}, found none; name its folder")
     return next((folder for folder, domain in matches if domain == OWN or is_known(domain)), matches[0][0])
+
+
+def sampling_command(pretrained: str, name: str, path: Path, domain: Domain) -> str:
+    """Command that samples a learned concept ``name`` of the model ``pretrained`` in a file."""
+    parts = ["python -m ftl_lightning sample --pretrained", shlex.quote(pretrained), "--concept", shlex.quote(str(path))]
+    if domain.observed:
+        parts += ["--goal", shlex.quote(name)] if domain.concepts.reads(name) else ["--initial FILE"]
+    return " ".join((*parts, "--count 10 --figure samples.png"))

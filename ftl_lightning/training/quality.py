@@ -73,8 +73,8 @@ def judged(domain: Domain, plans: Demonstrations, goal: str) -> dict[str, float]
     return means
 
 
-def picture(domain: Domain, plans: Demonstrations, goal: str = "") -> "Figure":
-    """Draw plans; with a goal, correct plans are framed green, wrong plans red.
+def picture(domain: Domain, plans: Demonstrations, goal: str = "", demonstrations: Demonstrations | None = None) -> "Figure":
+    """Draw plans, below ``demonstrations`` if given; with a goal, correct plans are framed green, wrong plans red.
 
     Raises:
         UserError: for a goal that the domain cannot judge.
@@ -84,7 +84,31 @@ def picture(domain: Domain, plans: Demonstrations, goal: str = "") -> "Figure":
         domain.check_goal(goal)
         right = right_plans(domain.measure(goal, plans.states, starts))
     framed = None if right is None else right[1].tolist()
-    return domain.show.picture(plans.states, framed, goal or "samples", starts if domain.observed else None)
+    title = goal or plans.concepts[0] or "samples"
+    return drawn(domain, plans.states, starts if domain.observed else None, framed, title, demonstrations)
+
+
+def drawn(
+    domain: Domain,
+    states: Tensor,
+    starts: InitialStates | None,
+    right: Sequence[bool] | None,
+    title: str,
+    demonstrations: Demonstrations | None,
+) -> "Figure":
+    """Draw samples ``(sample, horizon, state)``, below as many demonstrations or fewer if there are any, with the initial states
+    and verdicts of the samples.
+    """
+    if demonstrations is None:
+        return domain.show.picture(states, right, title, starts)
+    shown = slice(0, len(states))
+    windows, first = first_windows(demonstrations, states.shape[1]), demonstrations.initial_states
+    below = "samples" if right is None else f"samples: {sum(right)} right (green), {list(right).count(False)} wrong (red)"
+    names = ", ".join(dict.fromkeys(filter(None, demonstrations.concepts)))
+    above = Drawn(
+        ": ".join(filter(None, ("demonstrations", names))), windows[shown], first.take(shown) if domain.observed else None
+    )
+    return beside(domain.show, above, Drawn(below, states, starts, right), title)
 
 
 @dataclass(frozen=True)
