@@ -205,7 +205,7 @@ def short_overview(results: pd.DataFrame) -> Table:
                 _subject(domain, setting, metric),
                 "; ".join(f"{together(form)}: {cell}" if form else cell for form, cell in ours) or MISSING,
                 MISSING if rival is None else f"{label(*rival)} {_cell(domain, rows, rival, setting, metric)}",
-                ", ".join(f"{name} {mean:.2f}" for name, mean in best) or MISSING,
+                ", ".join(f"{name}{f' {ORACLE}' if name == FRESH else ''} {mean:.2f}" for name, mean in best) or MISSING,
                 MISSING if lead is None else prefix + (f"{lead.amount}, {lead.shown}" if lead.baseline == rival else str(lead)),
             ]
         )
@@ -213,16 +213,16 @@ def short_overview(results: pd.DataFrame) -> Table:
     caption = (
         f"New concepts, mean ± standard error over tasks{brackets}. {OURS} (ours): in the paper's form "
         "(parametrisation) unless another is named; networks, representations, most losses and some guidance weights are not the "
-        "paper's. Lead: the paper's form, or the form that the lead names, minus the best pretrained baseline; 95 % interval "
-        "over tasks"
+        "paper's. Lead: the paper's form, or the form before the colon, minus the best pretrained baseline; 95 % interval over "
+        "tasks"
     )
     head = ["domain: setting, metric", OURS, "best pretrained baseline", "best without pretraining; oracle", "lead"]
     return make_table(None, "overview", caption, lines, head)
 
 
 def together(form: str) -> str:
-    """A form of several parts in a cell: ``'with modes, knots'``, ``'with knots (form chosen)'``."""
-    return form.replace(f", {CHOSEN}", f" ({CHOSEN})").replace(", with ", ", ")
+    """A form of several parts in a cell: ``'with modes, knots'``, ``'with knots, form chosen'``."""
+    return form.replace(", with ", ", ")
 
 
 def overview_tables(results: pd.DataFrame) -> list[Table]:

@@ -28,8 +28,8 @@ from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.model_folder import find_model
 
 MARGIN, MOST_OF = 0.97, 0.8
-"""Maximum loss, relative to the unconditional loss, of a demonstration that a training concept explains; minimum
-share of explained demonstrations for a known task.
+"""Maximum loss, relative to the unconditional loss, of a demonstration that a training concept fits; minimum
+share of fitted demonstrations for a known task.
 """
 MOST_FAULTS = 6
 """Maximum number of reported findings, most severe first."""
@@ -43,7 +43,7 @@ MANY, OUTSIDE = 0.25, 3.0
 
 @dataclass(frozen=True)
 class Known:
-    """The training concept that explains demonstrations best.
+    """The training concept that fits demonstrations best.
 
     Attributes:
         text: text of the training concept.
@@ -57,12 +57,12 @@ class Known:
 
     @property
     def count(self) -> int:
-        """Number of demonstrations that it explains."""
+        """Number of demonstrations that it fits."""
         return sum(loss <= MARGIN for loss in self.losses)
 
     @property
     def clear(self) -> bool:
-        """Whether it explains nearly all demonstrations, and their mean loss."""
+        """Whether it fits nearly all demonstrations, and their mean loss."""
         return self.count >= MOST_OF * len(self.losses) and sum(self.losses) / len(self.losses) <= MARGIN
 
     def __str__(self) -> str:
@@ -71,8 +71,8 @@ class Known:
             return f"known: by its loss, {mean:.2f} of the unconditional loss, {self.text!r} is the nearest training concept"
         best = f"{self.text!r} ({self.count} of {len(self.losses)}, loss {mean:.2f} of the unconditional loss)"
         if self.clear:
-            return f"known: the model already explains them as {best}; if that is all you mean, no learning is needed"
-        return f"known: no training concept explains them all; the best is {best}"
+            return f"known: the model already fits them as {best}; if that is all you mean, no learning is needed"
+        return f"known: no training concept fits them all; the best is {best}"
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class Check:
         name: name of the concept.
         demonstrations: checked demonstrations.
         findings: faults and notes, errors and warnings first.
-        known: the training concept that explains them best; ``None`` without a model.
+        known: the training concept that fits them best; ``None`` without a model.
         left_out: leave-one-out losses; ``None`` without learning.
         combination: report on weighted sums of training concepts; empty without a model of a user's data.
         enough: whether the demonstrations suffice, by skill; ``None`` for fewer than three, or with a model of a shipped domain.
@@ -224,7 +224,7 @@ def combination_line(model: ConceptModel, demonstrations: Demonstrations, settin
     sets = combined(model, combination.weights)
     text = formula(sets.embeddings, sets.weights, model.config.training_concepts, model.training_embeddings.cpu())
     loss = float(combination.left_out.mean())
-    verdict = "explains" if loss <= MARGIN else "does not explain"
+    verdict = "fits" if loss <= MARGIN else "does not fit"
     unseen = f"demonstrations that its weights were not learned from (loss {loss:.2f} of the unconditional loss)"
     return f"sum: {short(text, 120)} {verdict} {unseen}"
 

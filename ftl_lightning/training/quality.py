@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SHOWN = 16
-"""Number of samples in a figure."""
+"""Number of samples in a figure, and of demonstrations above samples."""
 
 
 def right_plans(measured: Mapping[str, Tensor]) -> tuple[str, Tensor] | None:
@@ -96,12 +96,10 @@ def drawn(
     title: str,
     demonstrations: Demonstrations | None,
 ) -> "Figure":
-    """Draw samples ``(sample, horizon, state)``, below as many demonstrations or fewer if there are any, with the initial states
-    and verdicts of the samples.
-    """
+    """Draw samples ``(sample, horizon, state)`` with their initial states and verdicts, below the first demonstrations, if any."""
     if demonstrations is None:
         return domain.show.picture(states, right, title, starts)
-    shown = slice(0, len(states))
+    shown = slice(0, SHOWN)
     windows, first = first_windows(demonstrations, states.shape[1]), demonstrations.initial_states
     below = "samples" if right is None else f"samples: {sum(right)} right (green), {list(right).count(False)} wrong (red)"
     names = ", ".join(dict.fromkeys(filter(None, demonstrations.concepts)))

@@ -41,7 +41,7 @@ def test_a_known_concept_is_recognised_and_a_new_one_is_not_and_a_picture_is_dra
     assert "no learning is needed" in str(found)
     other = scenes.check(scenes.domain.source(None).draw(NEW, 5, 0), name=NEW).known
     assert not other.clear
-    assert str(other).startswith("known: no training concept explains them all")
+    assert str(other).startswith("known: no training concept fits them all")
     assert len(check_figure([found]).axes) == 2
 
 

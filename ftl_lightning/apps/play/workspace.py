@@ -272,7 +272,7 @@ class Workspace:
         """Undo that a concept was learned again from other demonstrations: return the former one, its samples and their quality."""
         former = self._known(request.id).former
         if former is None or former.learned is None or not isinstance(former.composition, LearnedConcept):
-            raise UserError("id: expected a concept that replaced another one, found none; learn one again first")
+            raise UserError(f"id: expected a concept with a former version, found {short(request.id)!r}; learn it again first")
         self._newest = former.learned
         known, found = self._measured(former, former.composition)
         return self._keep(request.id, known) | found

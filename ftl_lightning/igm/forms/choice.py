@@ -420,8 +420,8 @@ def _choice(shares: _Shares, qualities: Mapping[str, Quality]) -> tuple[str, str
     if shares.left_out is not None:
         losses = f"{shares.left_out:.2f} of the unconditional loss on left-out demonstrations, {shares.own:.2f} on its own"
     if not shares.suffices:
-        return MODES, f"one set of embeddings does not explain the demonstrations (loss {losses}), so samples stay close to them"
-    because, spread = f"one set of embeddings explains the demonstrations (loss {losses})", qualities[ADAPTED].spread
+        return MODES, f"one set of embeddings does not fit the demonstrations (loss {losses}), so samples stay close to them"
+    because, spread = f"one set of embeddings fits the demonstrations (loss {losses})", qualities[ADAPTED].spread
     if MIXED in qualities and (mixed := qualities[MIXED].spread) > spread:
         return MIXED, f"{because}; its samples spread {spread:.2f} of what the demonstrations do, mixtures {mixed:.2f}"
     return ADAPTED, f"{because}; samples spread {spread:.2f} of what the demonstrations do"

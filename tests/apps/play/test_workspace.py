@@ -196,7 +196,7 @@ def test_a_concept_learned_again_replaces_the_former_which_comes_back(
     back = after.restore(requests.Named(key))
     assert back["concepts"] == before
     assert after.concept_file(key) == former
-    with pytest.raises(UserError, match="expected a concept that replaced another one"):
+    with pytest.raises(UserError, match="expected a concept with a former version"):
         after.restore(requests.Named(key))
 
 
