@@ -187,7 +187,9 @@ class Demonstrations(Shown):
         for key, tensor in self.tensors.items():
             if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
                 where = (~torch.isfinite(tensor)).nonzero()[0].tolist()
-                raise UserError(f"key {key!r}: expected finite numbers, found {tensor[tuple(where)].item()} at index {where}")
+                advice = "; pad with any number and give 'lengths'" if key == "states" else ""
+                found = f"found {tensor[tuple(where)].item()} at index {where}"
+                raise UserError(f"key {key!r}: expected finite numbers, {found}{advice}")
 
     @classmethod
     def of(

@@ -22,7 +22,8 @@ HIGH, BETTER = 0.86, 0.6
 """Minimum skill of a reference that suffices, and of a learned form that is better than every reference."""
 RISING = 0.03
 """Minimum rise of the skill by the last demonstration for more to be asked for."""
-SEVERAL = 0.9
+SEVERAL = "they differ from each other as much as demonstrations of different training concepts"
+DISTINCT = 0.9
 """Minimum score of fresh demonstrations, relative to behaviour of all training concepts, for what is no single concept."""
 LEAST = 0.05
 """Score that is added to both in the ratio of a skill."""
@@ -86,7 +87,7 @@ class Enough:
         last = sizes[-1]
         wanted = {name: _wanted(skills, count) for name, skills in every.items()}
         name = max(every, key=lambda name: every[name][last])
-        if training is not None and fresh > SEVERAL:
+        if training is not None and fresh > DISTINCT:
             return cls(name, every[name], None, None, out, several=True)
         enough = [name for name, needed in wanted.items() if needed is not None and needed <= count]
         if enough:
@@ -112,7 +113,7 @@ class Enough:
         curve = ", ".join(f"{math.floor(100 * skill) / 100:.2f} from {size}" for size, skill in self.skills.items())
         without = f"without {numbered(self.without)}, " if self.without else ""
         if self.several:
-            return f"enough: {without}no: they differ from each other as much as demonstrations of different training concepts"
+            return f"enough: {without}no: {SEVERAL}"
         if self.better is not None:
             said = f"{self.name} has skill {self.better:.2f} on left-out demonstrations (the best reference {curve})"
         else:

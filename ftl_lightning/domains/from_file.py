@@ -291,7 +291,7 @@ def domain_from_file(
         check_precision(demonstrations)
     rows_of = demonstrations.rows_of
     expected = "texts of two concepts or more to pretrain on"
-    require(len(rows_of) >= 2, f"{path}: key 'concepts'", expected, len(rows_of))
+    require(len(rows_of) >= 2, f"{path}: key 'concepts'", expected, f"only {short(', '.join(map(repr, rows_of)))}")
     held_out = torch.zeros(len(demonstrations), dtype=torch.bool)
     for text, rows in rows_of.items():
         require(len(rows) >= 2, f"{path}: concept {text!r}", "two demonstrations or more (one is held out)", len(rows))

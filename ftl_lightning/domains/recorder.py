@@ -165,5 +165,5 @@ def drawn_by_hand(examples: Demonstrations, horizon: int) -> Recorder | None:
             provenance={"generator": "by hand"},
         )
 
-    hint = "Draw one line of the kind that you mean; how fast you draw does not matter."
+    hint = "Draw one line of the kind that you mean. The frame shows where other lines lie; speed does not matter."
     return Recorder("draw", hint, lambda task, seed: empty, record)

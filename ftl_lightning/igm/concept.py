@@ -143,9 +143,9 @@ class Choice:
             ((skills[name], name) for name in (*NAMES, VARIED, KNOWN) if name in skills and name != self.form), reverse=True
         )
         beside = ", ".join(f"{name} {value:.2f}" for value, name in others)
-        said = f"{self.form} has skill {skills[self.form]:.2f} on left-out demonstrations (without learning: {beside})"
+        said = f"skill {skills[self.form]:.2f} (without learning: {beside})"
         share = self.nearer.get(self.form)
-        return said if share is None else f"{said}, {share:.2f} of its samples are nearer to the demonstrations than to the {KNOWN}"
+        return said if share is None else f"{said}, {share:.2f} of samples nearer to demonstrations than to the {KNOWN}"
 
 
 @dataclass(frozen=True)

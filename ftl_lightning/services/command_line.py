@@ -1,5 +1,6 @@
 """Arguments of a verb: early checks of files, before slow imports, and short messages for a parser's errors."""
 
+import glob
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
@@ -113,7 +114,12 @@ def _demonstrations(path: str, option: str) -> None:
 
 
 def _concept(path: str, option: str) -> None:
-    check_readable(shipped(path), "concept")
+    file = shipped(path)
+    if len(file.parts) > 2 and not file.exists():  # a later invert writes to another log folder
+        others = file.parents[2].glob(f"*/{glob.escape(file.parent.name)}/{glob.escape(file.name)}")
+        if newest := max(others, key=lambda other: other.stat().st_mtime, default=None):
+            raise UserError(f"{path}: expected a concept file, found nothing; the newest of this name is {newest}")
+    check_readable(file, "concept")
 
 
 def _text(kind: str) -> Check:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ftl_lightning.data.check import Finding, axes, check
 from ftl_lightning.data.demonstrations import Demonstrations, paths_of
-from ftl_lightning.data.enough import Enough, Outliers
+from ftl_lightning.data.enough import SEVERAL, Enough, Outliers
 from ftl_lightning.data.features import moved
 from ftl_lightning.data.references import NAMES
 from ftl_lightning.igm.concept import KNOWN, Concept
@@ -37,6 +37,7 @@ COVERED_BY_A_PLAN = 0.8
 """Minimum share of the longest demonstration in a plan, for windows of demonstrations to need no note."""
 EXCESS = 0.05
 """Tolerated excess, as a share of half a column's pretraining range."""
+DIFFERS = "differs from the others more than is usual within a concept; another concept?"
 MANY, OUTSIDE = 0.25, 3.0
 """Warning thresholds: share of values outside the range, and maximum normalised value."""
 
@@ -187,8 +188,7 @@ def check_with(
         known = known_as(model, demonstrations, settings, advance)
     own, left, learned, outlier = model.examples, None, None, None
     if own is not None and (outlier := Outliers(own, model.horizon, model.places).outlier(demonstrations)) is not None:
-        text = "differs from the others more than is usual within a concept; another concept?"
-        faults = (*faults, Finding(text, rows=(outlier,)))
+        faults = (*faults, Finding(DIFFERS, rows=(outlier,)))
     if steps and len(demonstrations) > 1:
         find = find_outlier if own is None else lambda losses: outlier
         with bar(f"{name}: learning from some", steps) if progress else nothing as advance:
@@ -198,6 +198,15 @@ def check_with(
     enough = None if own is None else Enough.of(demonstrations, model.horizon, own, learned, faulty(faults), model.places)
     ordered = tuple(sorted(faults, key=lambda finding: finding.severity == "note"))
     return Check(name, demonstrations, ordered, known, left, combination_line(model, demonstrations, settings), enough, own is None)
+
+
+def several_concepts(model: ConceptModel, demonstrations: Demonstrations, outliers: Outliers) -> list[str]:
+    """Warnings that demonstrations do not belong to one concept, with a model of a user's data."""
+    enough = Enough.of(demonstrations, model.horizon, model.examples, followed=model.places)
+    if enough is not None and enough.several:
+        return [SEVERAL.capitalize()]
+    outlier = outliers.outlier(demonstrations)
+    return [] if outlier is None else [f"Demonstration {outlier + 1} {DIFFERS}"]
 
 
 def faulty(findings: Iterable[Finding]) -> set[int]:

@@ -111,7 +111,7 @@ def test_the_page_of_play_gives_no_tick_to_a_figure_without_a_part() -> None:
     judge = judge_of(model, [known])
     (shown, words), (cut, none) = (judged(model.model, judge, some, "heart") for some in plans)
     assert sum(film["right"] for film in shown) >= 14
-    assert "% right (nearest shape, parts: heart)" in words
+    assert "% of 20 samples alike (nearest shape, parts: heart)" in words
     assert sum(film["right"] for film in cut) <= 1
     assert none.startswith(("0%", "5%"))
     assert judged(model.model, judge, plans[0], "")[1] == ""

@@ -176,10 +176,9 @@ def test_the_form_of_ones_own_data_is_chosen_by_skill_beside_references(model: F
     assert all(0 < skill < 2 for skill in choice.skills.values())
     assert set(choice.nearer) == set(choice.skills)
     assert all(0 <= share <= 1 for share in choice.nearer.values())
-    assert f"{choice.nearer[choice.form]:.2f} of its samples are nearer to the demonstrations than to the {KNOWN}" in choice.words
-    assert f"{choice.form} has skill {choice.skills[choice.form]:.2f} on left-out demonstrations (without learning: " in str(
-        learned.quality
-    )
+    assert f"{choice.nearer[choice.form]:.2f} of samples nearer to demonstrations than to the {KNOWN}" in choice.words
+    assert f"skill {choice.skills[choice.form]:.2f} (without learning: " in str(learned.quality)
+    assert f"skill {choice.skills[choice.form]:.2f} ± " in choice.because
     assert model.learn(walks("between", 1), name="between").concept.choice.form == ONE
 
 

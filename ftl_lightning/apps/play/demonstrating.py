@@ -83,7 +83,7 @@ class Demonstrating:
             {"id": number, "film": films(self._domain, entry)[0], "flags": flags.get(row, [])}
             for row, (number, entry) in enumerate(self._entries.items())
         ]
-        return {"demonstrations": entries, "check": general, "undo": bool(self._before), "wanted": WANTED}
+        return {"demonstrations": entries, "check": general, "undo": bool(self._before), "wanted": WANTED, "name": self.name}
 
     def together(self, name: str) -> Demonstrations:
         """Demonstrations joined under the concept ``name``. Raise UserError if there are none."""

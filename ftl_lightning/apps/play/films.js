@@ -46,12 +46,13 @@ function addFilm() {
 
 function setFilm(one, film, view, label) {
   const judged = film.right === true ? "right" : film.right === false ? "wrong" : "";
-  one.label = judged ? `${label}: ${judged}` : label;
+  const verdict = judged && (state.verdicts || ["right", "wrong"])[judged === "right" ? 0 : 1];
+  one.label = judged ? `${label}: ${verdict}` : label;
   setCanvas(one, [film], view, one.label);
   one.button.setAttribute("aria-label", `${one.label}. Make it large`);
   one.button.classList.toggle("turnable", Boolean(film.space));
   one.figure.className = judged;
-  one.mark.textContent = judged === "right" ? "\u2713 right" : judged === "wrong" ? "\u2717 wrong" : "";
+  one.mark.textContent = judged ? `${judged === "right" ? "\u2713" : "\u2717"} ${verdict}` : "";
   one.told.textContent = film.told || "";
 }
 

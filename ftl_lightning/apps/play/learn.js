@@ -106,7 +106,7 @@ const justLearned = () => Boolean(learning.concept && !learning.stop && learning
 
 function suggested() {
   if (learning.concept && ongoing()) return learning.concept.name;
-  return learning.task ? unused(learning.task) : unused(`my ${(state.recorder && KINDS[state.recorder.kind]) || "behaviour"} 1`);
+  return learning.task || state.work.name ? unused(learning.task || state.work.name) : unused(`my ${(state.recorder && KINDS[state.recorder.kind]) || "behaviour"} 1`);
 }
 
 // Whether some of what is there is what the last concept was learned from: learning again replaces this concept.
@@ -294,9 +294,11 @@ async function learnAgain(id) {
 function learnedAgain(line) {
   const took = `${line.seconds.toFixed(0)} seconds`;
   learning.more = line.concept ? ` Learned more thoroughly in ${took}.` : ` Learning more thoroughly for ${took} was not better.`;
+  find("check").append(...line.check.map((text) => made("li", { textContent: `\u26A0 ${text}` })));
   if (line.concept) {
     keptAnew(line);
     mixed();
+    find("progress").hidden = true; // of the first learning
   }
   learnable();
   announce(`${learnedTold()}${line.concept ? ` ${line.quality.line}` : ""}`);

@@ -53,8 +53,8 @@ function card(concept) {
 
 function about(concept) {
   const parts = [];
-  if (concept.count) parts.push(many(concept.count, "demonstration"));
-  if (concept.accuracy !== null && concept.accuracy !== undefined) parts.push(`${concept.accuracy.toFixed(2)} right`);
+  if (concept.count) parts.push(many(concept.count, "demo"));
+  if (concept.accuracy !== null && concept.accuracy !== undefined) parts.push(`${concept.accuracy.toFixed(2)} ${state.verdicts[0]}`);
   return parts.join(" \u00b7 ");
 }
 

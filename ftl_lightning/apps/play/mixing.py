@@ -53,6 +53,11 @@ def starts_of(model: FewShot, tasks: Sequence[str], count: int, seed: int) -> tu
     raise UserError(f"task: expected a goal of {model.domain.name}, found {short(', '.join(tasks))!r}")
 
 
+def verdicts(model: ConceptModel) -> tuple[str, str]:
+    """Words for samples that are right, and for others. Samples of a user's data are only compared with demonstrations."""
+    return ("right", "wrong") if model.examples is None else ("alike", "different")
+
+
 def goal_of(domain: Domain, names: Sequence[str], task: str) -> str:
     """Goal by which a mixture is judged: the joined names if the domain reads them, else the requested task; empty for none."""
     reads = domain.concepts.reads
@@ -99,7 +104,8 @@ def judged(model: ConceptModel, domain: Domain, plans: Demonstrations, goal: str
     if success is None:
         return films(domain, plans), ""
     name, right = success
-    verdict = f"{float(right.float().mean()):.0%} right ({name.replace('_', ' ')}: {goal})"
+    word = verdicts(model)[0]
+    verdict = f"{float(right.float().mean()):.0%} of {len(right)} samples {word} ({name.replace('_', ' ')}: {goal})"
     return films(domain, plans, right.tolist(), marks), verdict
 
 

@@ -12,9 +12,10 @@ from typing import Any, TypeVar
 
 from ftl_lightning.apps.play import requests
 from ftl_lightning.apps.play.demonstrating import Demonstrating, as_npz
-from ftl_lightning.apps.play.mixing import Json, films, goal_of, judge_of, judged, samples, sampling_of, starts_of
+from ftl_lightning.apps.play.mixing import Json, films, goal_of, judge_of, judged, samples, sampling_of, starts_of, verdicts
 from ftl_lightning.apps.play.same import VARIABLES, Learned, Part, Sampled, command, python
 from ftl_lightning.data.demonstrations import Demonstrations
+from ftl_lightning.data.enough import Outliers
 from ftl_lightning.few_shot.learned_concept import LearnedConcept, Learning
 from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.few_shot.tuned import OWN
@@ -24,6 +25,7 @@ from ftl_lightning.igm.forms.quality import GENERATED
 from ftl_lightning.igm.settings import ONE, PAPER
 from ftl_lightning.services.errors import UserError, require, short
 from ftl_lightning.services.tensor_file import kind_of
+from ftl_lightning.training.checks import several_concepts
 
 SHOWN, SHOWN_FIRST = 8, 4  # number of samples shown of a learned concept, and during learning
 FIRST, INTERVAL, RATIO = 0.2, 0.5, 3.0
@@ -38,7 +40,9 @@ R = TypeVar("R")
 
 def title_of(model: str) -> str:
     """Title of a model on the page."""
-    return model.rpartition("/")[2].replace("_", " ")
+    path = Path(model)
+    name = path.parent.parent.name if path.name == "pretrained" and path.parent.name == "fit" else path.name
+    return name.replace("_", " ")
 
 
 class Stopped(Exception):
@@ -81,6 +85,13 @@ class Known:
         return content
 
 
+def _fewer(share: float | None, before: float | None) -> bool:
+    """Whether a share of :data:`GENERATED` samples is lower than before by two standard errors; ``False`` if not judged."""
+    if share is None or before is None:
+        return False
+    return before - share > 2 * ((share * (1 - share) + before * (1 - before)) / GENERATED) ** 0.5
+
+
 def _changing(change: Callable[[Demonstrating, R], None]) -> Callable[["Workspace", R], Json]:
     """Method that changes the demonstrations and returns the new work."""
 
@@ -106,6 +117,8 @@ class Workspace:
         self._concepts = {
             f"t{number}": Known(text, "training", self._model[text]) for number, text in enumerate(self._model.training_concepts)
         }
+        examples = self._model.model.examples
+        self._outliers = None if examples is None else Outliers(examples, self._model.model.horizon, self._model.model.places)
         learned = self._model.library().learned
         for number, entry in enumerate(learned):
             concept = self._model.load(str(entry.path))
@@ -129,6 +142,7 @@ class Workspace:
             "executes": domain.closed_loop is not None and domain.closed_loop.vector_film is not None,
             "groups": list(domain.plans.groups),
             "temperature": self._model.tuned.sampling.temperature,
+            "verdicts": verdicts(self._model.model),
             "concepts": self._listed(),
             "work": self.work(),
             "viewer": None,
@@ -278,8 +292,9 @@ class Workspace:
         return self._keep(request.id, known) | found
 
     def _learn_again(self, key: str, tell: Tell, stopped: Callable[[], bool]) -> None:
-        """Learn a concept in the form that its demonstrations select. It replaces the former concept unless this has the same form,
-        or more right samples.
+        """Learn a concept in the form that its demonstrations select, and tell whether they belong to one concept. It replaces the
+        former concept: for a user's data always, as it has the best score on left-out demonstrations; in other domains unless it
+        was learned in the same way or has fewer right samples by two standard errors.
         """
         (_, _, demonstrations), begin = self._learned_here(key), monotonic()
         changes, steps = self._settings(False)
@@ -290,10 +305,12 @@ class Workspace:
         content = replace(concept.concept, origin=replace(concept.concept.origin, name=before.name))
         learned = replace(former, changes=changes, steps=self._changed(steps))
         known, found = self._measured(replace(before, composition=concept, concept=content, learned=learned), concept)
-        if content.choice and content.choice.form != ONE and (known.accuracy or 0) >= (before.accuracy or 0):
+        same = content.choice is None or content.choice.form == ONE  # learned quickly with the same settings
+        if self._model.settings == OWN or not (same or _fewer(known.accuracy, before.accuracy)):
             self._newest = learned if self._newest is former else self._newest
             found |= self._keep(key, known)
-        tell({"done": True, "seconds": round(monotonic() - begin, 2)} | found)
+        warned = [] if self._outliers is None else several_concepts(self._model.model, demonstrations, self._outliers)
+        tell({"done": True, "seconds": round(monotonic() - begin, 2), "check": warned} | found)
 
     def _invert(
         self,
@@ -326,6 +343,8 @@ class Workspace:
         if len(known.demonstrations) > 1:
             measured = concept.quality.quality
             quality = {"line": ", ".join(filter(None, (words, measured.words))), "numbers": measured.numbers}
+        if (maker := concept.uncomposed.made) is not None:
+            quality["line"] += f". {concept.uncomposed.share:.0%} of the samples are {maker.name}, made without the model"
         same = self._same((Part(known.learned.label, learned=known.learned),), None)
         right = sum(decided) / len(decided) if decided else None
         return replace(known, accuracy=right), {"samples": shown[:SHOWN], "quality": quality, "same": same}

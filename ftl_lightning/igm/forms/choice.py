@@ -283,18 +283,19 @@ def by_skill(
         mixed = (1 - share, both[variation]), (share, made[maker, variation])
         nearer[called] = sum(part * left.nearer(value, known) for part, value in mixed)
         numbers |= {f"{NEARER}{name}": round(value, 4) for name, value in nearer.items()}
-    because = f"{_because(skills[called], skills[form], form, varied, share)}; {beside}"
+    beside += ", which is higher" if skills[rival] > skills[called] else ""
+    measured = f"skill {skills[called]:.2f} ± {left.error(mixture[number]):.2f} on left-out demonstrations"
+    because = f"{_because(measured, skills[form], form, varied, share)}; {beside}"
     composing = None if COMBINED not in whole or form == COMBINED else (whole[COMBINED].embeddings, whole[COMBINED].weights)
     keep = composing is not None and float(drawn[COMBINED].score.mean()) <= float(drawn[ONE].score.mean())
     return replace(chosen, choice=Choice(called, because, numbers), composing=composing if keep else None)
 
 
-def _because(skill: float, alone: float, form: str, made: str, share: float) -> str:
-    """Reason for a form of :func:`by_skill`: its skill, and that of the learned ``form`` ``alone``."""
+def _because(skill: str, alone: float, form: str, made: str, share: float) -> str:
+    """Reason for a form of :func:`by_skill`: its ``skill`` in words, and that of the learned ``form`` ``alone``."""
     if share == 1:
-        return f"no learned form adds to {made} (skill {skill:.2f} on left-out demonstrations, {form} alone {alone:.2f})"
-    said = f"skill {skill:.2f} on left-out demonstrations"
-    return f"{said}, {alone:.2f} without the {share:.0%} of samples that are {made}, not learned" if share else said
+        return f"no learned form adds to {made} ({skill}, {form} alone {alone:.2f})"
+    return f"{skill}, {alone:.2f} without the {share:.0%} of samples that are {made}, not learned" if share else skill
 
 
 @dataclass(frozen=True)

@@ -180,8 +180,8 @@ class LeaveOneOut:
         outlier = "outlier: none is explained much worse than the others"
         if self.outlier is not None:
             loss, others = self.left_out[self.outlier], [loss for row, loss in enumerate(self.left_out) if row != self.outlier]
-            outlier = f"outlier: demonstration {self.outlier + 1}, loss {loss:.2f} when it is left out"
-            outlier += f" (others at most {max(others):.2f}); another concept, or a mistake?"
+            worst = f", loss {loss:.2f} when it is left out (others at most {max(others):.2f})" if loss > max(others) else ""
+            outlier = f"outlier: demonstration {self.outlier + 1}{worst}; another concept, or a mistake?"
         curve = ", ".join(f"{loss:.2f} from {size}" for size, loss in self.curve.items())
         verdict = "still falls: more are likely to help" if self.falling else "hardly falls any more: these suffice"
         if not self.falling and [1.0, *self.curve.values()][-1] >= COVERED:

@@ -16,10 +16,11 @@ from ftl_lightning.igm.model import Invertible
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.services.randomness import generator, task_key
 
-COPIES, COLLAPSED, ROUGH = 0.2, 0.5, 1.5
-"""Thresholds: minimum novelty, minimum spread, maximum roughness."""
-SCATTERED = 2.0
-"""Threshold: maximum spread."""
+COPIES, COLLAPSED, SMOOTHED = 0.2, 0.5, 0.67
+"""Minimum novelty, spread and roughness; fresh demonstrations of ten data sets of own data have a roughness of 0.67 or more."""
+SCATTERED, ROUGH = 2.0, 1.5
+"""Maximum spread and roughness."""
+THAN = "than your demonstrations"
 GENERATED = 40
 """Number of generated samples."""
 SAMPLING = Sampling("dpm_solver", 10, 1.0)
@@ -77,7 +78,7 @@ class Quality:
         words = [
             f"spread {self.spread:.2f}{_remark(self.spread, COLLAPSED, 'collapsed', SCATTERED, 'scattered')}",
             f"relative novelty {self.novelty:.2f}{_remark(self.novelty, COPIES, 'copies')}",
-            f"roughness {self.roughness:.2f}{_remark(self.roughness, 0, '', ROUGH, 'rougher than your demonstrations')}",
+            f"roughness {self.roughness:.2f}{_remark(self.roughness, SMOOTHED, f'smoother {THAN}', ROUGH, f'rougher {THAN}')}",
         ]
         return ", ".join(words)
 

@@ -116,6 +116,10 @@ class LeftOut:
         """Skill of a mean score."""
         return 1 / (float(score) + float((LEAST / (self.fresh + LEAST)).mean()))
 
+    def error(self, scores: Tensor) -> float:
+        """Standard error of the skill over left-out demonstrations, from scores ``(fold,)``, two or more (delta method)."""
+        return self.skill(scores.mean()) ** 2 * float(scores.std() / len(scores) ** 0.5)
+
     def parts(self) -> list[Demonstrations]:
         """The demonstrations without each left-out one, ``(fold,)``."""
         return [self.demonstrations.rows(rows) for rows in self.others]

@@ -183,7 +183,7 @@ def test_what_is_learned_is_mixed_forgotten_and_renamed(page: Browser) -> None:
     learned(page)
     # Alone in the mix; a second one beside it, half and half.
     assert page.js(WEIGHTS) == [["my stroke 1", "1"]]
-    assert page.js("document.querySelector('#concepts .pick .about').textContent").startswith("5 demonstrations · ")
+    assert page.js("document.querySelector('#concepts .pick .about').textContent").startswith("5 demos · ")
     page.js("(find('name').value = '', find('name').focus())")
     page.press("my stroke 2")
     page.click("learn")  # again from the same, with another name

@@ -96,7 +96,7 @@ def test_somebody_rates_everything_with_a_break_and_the_report_takes_the_file(
     assert len(page.js(SHADES)) > 20
     assert page.js("document.documentElement.scrollWidth <= window.innerWidth")
     asked = rater.question
-    page.until(lambda: rater.reload() == (asked, 7), 10)  # a browser stores answers shortly after a script has set them
+    page.until(lambda: rater.reload() == (asked, 7))  # a browser stores answers shortly after a script has set them
     rater.answer(5)
     asked = rater.question
     assert page.driver.get_log("browser") == []

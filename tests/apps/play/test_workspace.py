@@ -88,7 +88,7 @@ def test_learning_tells_loss_and_samples_as_it_goes(taught: Taught) -> None:
     assert last["done"]
     assert len(last["samples"]) == 8
     assert last["concept"]["accuracy"] > 0.8
-    assert f"% right (accuracy: {TASK})" in last["quality"]["line"]
+    assert f"% of 40 samples right (accuracy: {TASK})" in last["quality"]["line"]
     assert "novelty" in last["quality"]["line"]
     assert "accuracy" in last["quality"]["line"]
     assert [one["kind"] for one in last["concepts"]].count("learned") == 1
@@ -159,7 +159,7 @@ def test_two_learned_concepts_are_mixed(after: Workspace, key: str, monkeypatch:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("accuracy", "better"), [(0.0, True), (1.1, False)])
+@pytest.mark.parametrize(("accuracy", "better"), [(0.0, True), (1.0, False)])
 def test_learning_again_replaces_what_is_not_better(
     after: Workspace, key: str, accuracy: float, better: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
