@@ -151,7 +151,7 @@ def test_files_and_options_that_are_no_domain_are_told_and_files_without_texts_g
     one = write(tmp_path / "one.npz", ("go up",))
     few = write(tmp_path / "few.npz", count=1)
     for path, message in (
-        (one, r"one\.npz: key 'concepts': expected texts of two concepts or more to pretrain on, found 1"),
+        (one, r"one\.npz: key 'concepts': expected texts of two concepts or more to pretrain on, found only 'go up'"),
         (few, r"few\.npz: concept 'go right': expected two demonstrations or more \(one is held out\), found 1"),
         (str(tmp_path / "none.npz"), r"none\.npz: expected a demonstrations file, found nothing"),
     ):
