@@ -221,8 +221,10 @@ def short_overview(results: pd.DataFrame) -> Table:
 
 
 def together(form: str) -> str:
-    """A form of several parts in a cell: ``'with modes, knots'``, ``'with knots, form chosen'``."""
-    return form.replace(", with ", ", ")
+    """A form of several parts in a cell: ``'with modes, knots'``, ``'form chosen, with knots'``."""
+    parts = form.removesuffix(f", {CHOSEN}")
+    listed = parts.replace(", with ", ", ")
+    return listed if parts == form else f"{CHOSEN}, {listed}"
 
 
 def overview_tables(results: pd.DataFrame) -> list[Table]:
