@@ -213,7 +213,7 @@ def short_overview(results: pd.DataFrame) -> Table:
     caption = (
         f"New concepts, mean ± standard error over tasks{brackets}. {OURS} (ours): in the paper's form "
         "(parametrisation) unless another is named; networks, representations, most losses and some guidance weights are not the "
-        "paper's. Lead: the paper's form, or the form before the colon, minus the best pretrained baseline; 95 % interval over "
+        "paper's. Lead: the paper's form, or the form named there, minus the best pretrained baseline; 95 % interval over "
         "tasks"
     )
     head = ["domain: setting, metric", OURS, "best pretrained baseline", "best without pretraining; oracle", "lead"]
