@@ -274,8 +274,8 @@ def by_skill(
     skills = {name: left.skill(value.score.mean()) for name, value in every.items()}
     rival = max((*references, VARIED), key=lambda name: skills[name])
     beside = f"the best reference, the {rival}, has {skills[rival]:.2f}"
-    varied = maker if not variation or maker == VARIED else f"deformed {maker}"
-    called = form if not share else varied if share == 1 else f"{form} and {varied}"
+    deformed = "deformed " if variation and maker != VARIED else ""  # varied demonstrations contain it
+    called = form if not share else f"{deformed}{maker}" if share == 1 else f"{deformed}{form} and {maker}"
     skills[called] = left.skill(mixture[number].mean())
     numbers = {f"{SKILL}{name}": round(value, 4) for name, value in skills.items()}
     if (known := references.get(KNOWN)) is not None:
@@ -285,7 +285,7 @@ def by_skill(
         numbers |= {f"{NEARER}{name}": round(value, 4) for name, value in nearer.items()}
     beside += ", which is higher" if skills[rival] > skills[called] else ""
     measured = f"skill {skills[called]:.2f} ± {left.error(mixture[number]):.2f} on left-out demonstrations"
-    because = f"{_because(measured, skills[form], form, varied, share)}; {beside}"
+    because = f"{_because(measured, skills[form], form, called if share == 1 else maker, share)}; {beside}"
     composing = None if COMBINED not in whole or form == COMBINED else (whole[COMBINED].embeddings, whole[COMBINED].weights)
     keep = composing is not None and float(drawn[COMBINED].score.mean()) <= float(drawn[ONE].score.mean())
     return replace(chosen, choice=Choice(called, because, numbers), composing=composing if keep else None)
