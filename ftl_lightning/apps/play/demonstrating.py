@@ -50,6 +50,11 @@ class Demonstrating:
         return next((entry.concepts[0] for entry in self._entries.values() if entry.concepts[0]), "")
 
     @property
+    def numbers(self) -> tuple[int, ...]:
+        """Numbers of the present demonstrations."""
+        return tuple(self._entries)
+
+    @property
     def library(self) -> Json:
         """Tasks whose demonstrations can be drawn; ``why`` they are generated, or the reason why there are none."""
         if self._library is None:

@@ -49,7 +49,7 @@ function grow(samples) {
   if (recorder.kind !== "draw" || !recorder.scene || recorder.down) return;
   const strokes = state.work.demonstrations.map((one) => lineOf(one.film)).filter((line) => line.length);
   const to = samples.slice(0, strokes.length).map(lineOf).filter((line) => line.length);
-  const grown = recorder.grown = { strokes, from: recorder.grown ? shapesNow(recorder.grown) : strokes, to, start: still() ? -GROW : performance.now() };
+  const grown = recorder.grown = { of: shownNow(), strokes, from: recorder.grown ? shapesNow(recorder.grown) : strokes, to, start: still() ? -GROW : performance.now() };
   const move = () => {
     redraw();
     if (recorder.grown === grown && performance.now() < grown.start + GROW) requestAnimationFrame(move);

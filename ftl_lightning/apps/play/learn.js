@@ -1,5 +1,5 @@
 // Steps 1 and 2: the demonstrations that are there, and learning a concept from them.
-const learning = { stop: null, again: null, concept: null, from: "", seconds: 0, more: "", samples: [], named: false, losses: [], ids: new Set(), unsaved: new Map() };
+const learning = { stop: null, again: null, concept: null, from: "", samples: [], named: false, losses: [], changing: Promise.resolve(), more: "", back: false, unsaved: new Map() };
 const many = (count, one) => `${count} ${one}${count === 1 ? "" : "s"}`;
 const announce = (text) => { find("announced").textContent = text; };
 
@@ -7,8 +7,12 @@ const announce = (text) => { find("announced").textContent = text; };
 
 // Shows demonstrations. Where some were just added and there are enough, learning starts by itself.
 function worked(work, added = false) {
-  if (recorder.grown && JSON.stringify(work.demonstrations.map((one) => one.id)) !== learning.from) recorder.grown = null;
   state.work = work;
+  if (recorder.grown && recorder.grown.of !== shownNow()) { recorder.grown = null; redraw(); }
+  if (JSON.stringify(work.concepts) !== JSON.stringify(state.concepts)) { state.concepts = work.concepts; conceptList(); }
+  learning.back = false;
+  if (learning.concept && !conceptOf(learning.concept.id)) noConcept();
+  if (!learning.concept && !learning.stop) learning.concept = state.concepts.find((one) => one.from.length && JSON.stringify(one.from) === shownNow()) || null;
   if (!work.demonstrations.length) learning.task = "";
   slots();
   find("check").replaceChildren(...checks(work).map((text) => made("li", { textContent: text })));
@@ -84,7 +88,10 @@ function emptySlot(list, number) {
   slot.film = addFilm();
   slot.flag = made("span", { className: "flag", ariaHidden: "true" });
   slot.rubbish = made("button", { type: "button", className: "remove", textContent: "\u00d7", ariaLabel: `Remove demonstration ${number + 1}` });
-  slot.rubbish.addEventListener("click", () => attempt(async () => worked(await ask("/api/remove", { id: slot.number }))));
+  slot.rubbish.addEventListener("click", () => {
+    const id = slot.number;
+    if (state.work.demonstrations.some((one) => one.id === id)) changing(async () => worked(await ask("/api/remove", { id })));
+  });
   slot.append(made("span", { className: "number", textContent: number + 1 }), slot.flag, slot.film.figure, slot.rubbish);
   list.append(slot);
   return slot;
@@ -102,7 +109,7 @@ const KINDS = { draw: "stroke", arrange: "arrangement", steer: "trip" };
 const shownNow = () => JSON.stringify(state.work.demonstrations.map((one) => one.id));
 
 // Whether what is there is what the last concept was learned from, whose name is then the one that is shown and changed.
-const justLearned = () => Boolean(learning.concept && !learning.stop && learning.from === shownNow());
+const justLearned = () => Boolean(learning.concept && !learning.stop && JSON.stringify(conceptOf(learning.concept.id).from) === shownNow());
 
 function suggested() {
   if (learning.concept && ongoing()) return learning.concept.name;
@@ -110,7 +117,7 @@ function suggested() {
 }
 
 // Whether some of what is there is what the last concept was learned from: learning again replaces this concept.
-const ongoing = () => state.work.demonstrations.some((one) => learning.ids.has(one.id));
+const ongoing = () => state.work.demonstrations.some((one) => conceptOf(learning.concept.id).from.includes(one.id));
 
 // A name that no concept has: numbers count up.
 function unused(name) {
@@ -126,21 +133,26 @@ function learnable() {
   find("learn").disabled = count < 2;
   find("learn").textContent = on ? "Start again" : "Learn";
   find("learn-why").textContent = count === 1 ? "Show at least two" : "";
-  find("rename").hidden = !justLearned() || find("name").value.trim() === learning.concept.name;
+  find("rename").hidden = !justLearned() || named() === learning.concept.name;
   if (on) return;
   const enough = count >= state.work.wanted, waiting = find("waiting");
   waiting.classList.toggle("warned", enough && !justLearned() && Boolean(doubt()));
   if (enough && !justLearned() && doubt()) waiting.textContent = doubt();
-  else if (learning.concept && (justLearned() || !count)) waiting.textContent = learnedTold();
+  else if (learning.concept && (justLearned() || !count || learning.back)) waiting.textContent = learnedTold();
   else if (enough) waiting.textContent = "Press Learn.";
   else waiting.textContent = `Learning starts by itself at demonstration ${state.work.wanted}${count >= 2 ? "; or press Learn now" : ""}.`;
 }
 
-const learnedTold = () => `Learned \u201c${learning.concept.name}\u201d in ${learning.seconds.toFixed(1)} seconds.${learning.more}`;
+const named = () => find("name").value.trim().replace(/\s+/g, " ");
+
+function learnedTold() {
+  const { name, seconds } = conceptOf(learning.concept.id);
+  return `Learned \u201c${name}\u201d in ${seconds.toFixed(1)} seconds.${learning.more}`;
+}
 
 // Gives the concept that was just learned the name that stands in the field.
 function rename() {
-  const name = find("name").value.trim().replace(/\s+/g, " ");
+  const name = named();
   if (!justLearned() || !name || name === learning.concept.name) return;
   if (state.concepts.some((one) => one.name === name)) { tellError(`A concept has the name \u201c${name}\u201d already: choose another one.`); return; }
   attempt(async () => {
@@ -149,7 +161,7 @@ function rename() {
     learning.concept = { ...learning.concept, name };
     if (learning.unsaved.has(learning.concept.hash + learning.concept.id)) learning.unsaved.set(learning.concept.hash + learning.concept.id, name);
     await renew(found);
-    samplesTold(learning.samples, name);
+    samplesTold(learning.samples, name, "");
     announce(`The concept is called ${name}.`);
   });
 }
@@ -165,7 +177,7 @@ function saveConcept(id) {
 // Goes on without what the last concept showed: another model is worked with, or the concept is there no more.
 function noConcept() {
   if (learning.again) learning.again.abort();
-  Object.assign(learning, { concept: null, from: "", samples: [] });
+  Object.assign(learning, { concept: null, from: "", samples: [], more: "" });
   fill(find("samples"), [], null, () => "");
   find("quality").textContent = "";
   find("progress").hidden = find("learned").hidden = find("meaning").hidden = true;
@@ -181,9 +193,9 @@ function learnInSight() {
 
 async function learn() {
   for (const one of [learning.stop, learning.again]) if (one) one.abort();
-  const wanted = (find("name").value.trim() || suggested()).replace(/\s+/g, " "), stop = learning.stop = new AbortController();
+  const wanted = named() || suggested(), stop = learning.stop = new AbortController();
   const former = state.concepts.find((one) => one.kind === "learned" && one.name === wanted), name = former ? wanted : unused(wanted);
-  Object.assign(learning, { concept: null, losses: [], from: shownNow(), ids: new Set(state.work.demonstrations.map((one) => one.id)) });
+  Object.assign(learning, { concept: null, losses: [], from: shownNow(), more: "" });
   find("name").value = name;
   document.body.dataset.learning = "yes";
   find("quality").textContent = "";
@@ -198,19 +210,25 @@ async function learn() {
       if (stop.signal.aborted) return;
       if (line.error) throw new Error(line.error);
       if (line.loss !== undefined) lossTold(line);
-      if (line.samples) samplesTold(line.samples, name);
+      if (line.samples) samplesTold(line.samples, name, learning.from);
       if (line.done) learned(line);
     }
   });
-  if (learning.stop !== stop) return; // something newer is learned
+  if (learning.stop === stop) noLearning(); // nothing newer is learned
+}
+
+function noLearning() {
+  if (learning.stop) learning.stop.abort();
   learning.stop = null;
   document.body.dataset.learning = "no";
   find("progress").hidden = !learning.concept;
   learnable();
+  undoable();
 }
 
-function samplesTold(samples, name) {
-  grow(samples);
+// Samples of what was learned from demonstrations (`from`), which grow on the canvas as long as these are there.
+function samplesTold(samples, name, from) {
+  if (from === shownNow()) grow(samples);
   // The scale of the demonstrations, so that both can be compared.
   const view = viewOf([...state.work.demonstrations.map((one) => one.film), ...samples]);
   fill(find("samples"), samples, view, (number) => `Sample ${number + 1} of ${name}`);
@@ -243,7 +261,7 @@ function lossCurve(steps) {
 }
 
 function learned(line) {
-  Object.assign(learning, { named: false, seconds: line.seconds, more: line.more ? " It is being learned more thoroughly \u2026" : "" });
+  Object.assign(learning, { named: false, more: line.more ? " It is being learned more thoroughly \u2026" : "" });
   keptAnew(line);
   if (learning.losses.length) {
     const [last] = learning.losses.at(-1);
@@ -265,7 +283,7 @@ function kept(line) {
   find("quality").textContent = line.quality.line;
   find("learned").hidden = find("meaning").hidden = false;
   same("work", line.same);
-  samplesTold(line.samples, line.concept.name);
+  samplesTold(line.samples, line.concept.name, JSON.stringify(line.concept.from));
 }
 
 // The same in the place of an earlier concept, whose film is another one.
@@ -294,7 +312,7 @@ async function learnAgain(id) {
 function learnedAgain(line) {
   const took = `${line.seconds.toFixed(0)} seconds`;
   learning.more = line.concept ? ` Learned more thoroughly in ${took}.` : ` Learning more thoroughly for ${took} was not better.`;
-  find("check").append(...line.check.map((text) => made("li", { textContent: `\u26A0 ${text}` })));
+  if (justLearned()) find("check").append(...line.check.map((text) => made("li", { textContent: `\u26A0 ${text}` })));
   if (line.concept) {
     keptAnew(line);
     mixed();
@@ -359,11 +377,18 @@ function undoable() {
   find("undo").title = `Ctrl+Z${replaced() ? `: brings back the former \u201c${learning.concept.name}\u201d` : ""}`;
 }
 
-const undo = () => attempt(async () => {
+// Changes of demonstrations, one after another. What is being learned from them is given up.
+function changing(change) {
+  if (learning.stop) noLearning();
+  learning.changing = learning.changing.then(() => attempt(change));
+  return learning.changing;
+}
+
+const undo = () => changing(async () => {
   if (!replaced()) { worked(await ask("/api/undo", {})); return; }
   if (learning.again) learning.again.abort();
   const line = await ask("/api/restore", { id: learning.concept.id });
-  Object.assign(learning, { more: " The former one is back.", named: false });
+  Object.assign(learning, { more: " The former one is back.", back: true, named: false });
   find("progress").hidden = true;
   keptAnew(line);
   mixed();
@@ -374,7 +399,7 @@ const undo = () => attempt(async () => {
 
 function listenToWork() {
   find("undo").addEventListener("click", undo);
-  find("clear").addEventListener("click", () => attempt(async () => worked(await ask("/api/clear", {}))));
+  find("clear").addEventListener("click", () => changing(async () => worked(await ask("/api/clear", {}))));
   find("learn").addEventListener("click", learn);
   find("name").addEventListener("input", () => { learning.named = find("name").value.trim() !== ""; learnable(); });
   find("name").addEventListener("keydown", (event) => { if (event.key === "Enter") rename(); });
@@ -397,7 +422,8 @@ function listenToWork() {
   find("upload").addEventListener("change", async () => { await upload(find("upload").files[0]); find("upload").value = ""; });
   for (const button of document.querySelectorAll("[data-copies]")) button.addEventListener("click", () => copy(button));
   addEventListener("keydown", (event) => {
-    if (event.key.toLowerCase() !== "z" || !(event.ctrlKey || event.metaKey) || event.shiftKey || ["text", "search"].includes(event.target.type)) return;
+    if (event.key.toLowerCase() !== "z" || !(event.ctrlKey || event.metaKey) || event.shiftKey || event.repeat || ["text", "search"].includes(event.target.type)) return;
+    if (recorder.down || find("large").open || find("sure").open) return;
     if (!find("undo").disabled && !answers) { event.preventDefault(); undo(); }
   });
   for (const kind of ["dragover", "drop"]) {

@@ -155,6 +155,7 @@ function firstMix() {
 
 // What was just learned is in the mix alone, or half and half with what was learned before, or added to what a person chose.
 function mixLearned(concept) {
+  if (mix.parts.some((one) => one.id === concept.id)) { mixed(); return; } // learned again
   const learned = (one) => conceptOf(one.id).kind === "learned", there = mix.parts.filter((one) => conceptOf(one.id) && one.id !== concept.id);
   const chosen = there.filter((one) => !one.automatic), before = chosen.length ? chosen : there.filter(learned).slice(-1);
   mix.parts = [...before, part(concept.id, true)];

@@ -103,9 +103,10 @@ def answers_of(
     state = workspace.state()
     mixes = pairs_of(state["concepts"], pairs)
     identifiers = set(itertools.chain(*mixes))
-    concepts = [concept for concept in state["concepts"] if concept["id"] in identifiers]
+    concepts = [concept | {"seconds": 0} for concept in state["concepts"] if concept["id"] in identifiers]
     offline = {"weights": list(WEIGHTS), "pairs": [list(pair) for pair in mixes]}
     answers: dict[str, Any] = {"/api/state": state | {"concepts": concepts, "models": [], "offline": offline}}
+    answers["/api/state"]["work"] |= {"concepts": concepts}
     for concept in concepts:
         answers[request_key(f"/api/thumbnail?id={concept['id']}")] = workspace.thumbnail(concept["id"])
     for pair in mixes:

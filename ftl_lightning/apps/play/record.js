@@ -2,7 +2,7 @@
 const TAP = 8; // pixels: a shorter line was none
 const STEP = 1 / 30; // seconds between places of a path
 const recorder = { kind: "", scene: null, coming: null, queue: Promise.resolve(), at: [], shown: [], path: [], times: [], down: false,
-  held: null, grown: null, keys: new Set(), penKeys: false, pen: null, pointer: null, passed: 0, last: 0, busy: 0 };
+  held: null, grown: null, before: null, keys: new Set(), penKeys: false, pen: null, pointer: null, passed: 0, last: 0, busy: 0 };
 
 const board = () => find("show");
 
@@ -184,7 +184,7 @@ function endStroke() {
   const long = line.some(([x, y]) => Math.hypot(x - line[0][0], y - line[0][1]) > away);
   if (!long) {
     hint(recorder.penKeys ? "Move the pen with the arrow keys while it is down." : "That was only a dot: press, draw a line, then let go.");
-    recorder.path = [];
+    Object.assign(recorder, { path: [], grown: recorder.before });
     redraw();
     return;
   }
@@ -199,7 +199,7 @@ function pointerDown(event) {
   const place = placeOf(event);
   if (recorder.kind === "draw") {
     if (recorder.penKeys) penMode(false); // who presses on the canvas draws
-    Object.assign(recorder, { down: true, grown: null, path: [[place]], times: [0], began: event.timeStamp });
+    Object.assign(recorder, { down: true, before: recorder.grown, grown: null, path: [[place]], times: [0], began: event.timeStamp });
   } else if (recorder.kind === "arrange") {
     recorder.held = under(place);
     if (recorder.held === null) { hint("Press on a piece and drag it."); return; }
@@ -240,7 +240,7 @@ function pointerUp() {
 }
 
 function pointerCancel() { // such as a second finger that zooms
-  if (recorder.kind === "draw" && !recorder.penKeys) recorder.path = [];
+  if (recorder.kind === "draw" && !recorder.penKeys) Object.assign(recorder, { path: [], grown: recorder.before });
   recorder.down = false;
   recorder.held = recorder.pointer = null;
   if (recorder.scene) redraw();
@@ -264,7 +264,7 @@ function keyDown(event) {
     event.preventDefault();
     if (event.repeat) return;
     if (recorder.down) { endStroke(); return; }
-    Object.assign(recorder, { down: true, grown: null, path: [[[...recorder.pen]]], times: [0] });
+    Object.assign(recorder, { down: true, before: recorder.grown, grown: null, path: [[[...recorder.pen]]], times: [0] });
     hint("The pen is down: arrow keys draw, space lifts it and keeps the stroke, Escape throws it away.");
     redraw();
   } else if (draws && key === "Escape" && recorder.down) {

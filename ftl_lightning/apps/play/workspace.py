@@ -61,6 +61,7 @@ class Known:
         task: task of the demonstrations, if the library gave them; its initial states are sampled from.
         accuracy: fraction of correct samples; ``None`` if not judged.
         former: concept that this one replaced; ``None`` for none.
+        source, seconds: numbers of the demonstrations it was learned from here, and how long that took.
     """
 
     name: str
@@ -73,16 +74,26 @@ class Known:
     task: str = ""
     accuracy: float | None = None
     former: "Known | None" = None
+    source: tuple[int, ...] = ()
+    seconds: float = 0.0
 
     @property
     def content(self) -> Json:
         """Content for the page's list of concepts; the form is empty for training concepts."""
         content: Json = {"name": self.name, "kind": self.kind, "count": None, "form": "", "accuracy": self.accuracy}
-        content["former"] = self.former is not None
+        content |= {"former": self.former is not None, "from": list(self.source), "seconds": self.seconds}
         if (concept := self.concept) is not None:
             content["count"] = concept.origin.count
             content["form"] = concept.choice.form if concept.choice else "modes" if concept.modes else "one set"
         return content
+
+
+def _renamed(known: Known, name: str, label: str) -> Known:
+    """A concept that was learned or opened here, and its former versions, under another name."""
+    concept = known.concept and replace(known.concept, origin=replace(known.concept.origin, name=name))
+    learned = known.learned and replace(known.learned, label=label)
+    former = known.former and _renamed(known.former, name, label)
+    return replace(known, name=name, concept=concept, learned=learned, former=former)
 
 
 def _fewer(share: float | None, before: float | None) -> bool:
@@ -152,7 +163,7 @@ class Workspace:
     def work(self) -> dict[str, Any]:
         """Current demonstrations and findings of their check."""
         parts = (Part(self._newest.label, learned=self._newest),) if self._newest else ()
-        return self._demonstrating.report() | {"same": self._same(parts, None)}
+        return self._demonstrating.report() | {"same": self._same(parts, None), "concepts": self._listed()}
 
     @property
     def suggestion(self) -> str:
@@ -239,10 +250,9 @@ class Workspace:
         known, name = self._editable(request.id), " ".join(request.name.split())
         if name == known.name or known.concept is None:
             return
-        concept = replace(known.concept, origin=replace(known.concept.origin, name=name))
-        learned = known.learned and replace(known.learned, label=self._unused(name))
-        self._newest = learned if self._newest is known.learned else self._newest
-        self._concepts[request.id] = replace(known, name=name, concept=concept, learned=learned)
+        label = self._unused(name)
+        self._concepts[request.id] = renamed = _renamed(known, name, label)
+        self._newest = renamed.learned if self._newest is known.learned else self._newest
 
     def learn(self, request: requests.Learn, tell: Tell, stopped: Callable[[], bool]) -> None:
         """Learn a concept quickly, and report loss and samples meanwhile by ``tell``; or learn it again, see
@@ -259,7 +269,10 @@ class Workspace:
             return self._learn_again(request.again, tell, stopped)
         name = " ".join(request.name.split())
         demonstrations, task, begin = self._demonstrating.together(name), self._demonstrating.task, monotonic()
-        former, how, _ = self._learned_here(request.replaces) if request.replaces else (None, None, None)
+        source = self._demonstrating.numbers
+        same = (key for key, known in self._concepts.items() if known.kind == "learned" and known.name == name)
+        key = request.replaces or next(same, "")  # another tab may have learned it
+        former, how, _ = self._learned_here(key) if key else (None, None, None)
         changes, steps = self._settings(True)
         due, reported = begin + FIRST, begin
 
@@ -276,11 +289,12 @@ class Workspace:
         self._count += 1
         label = how.label if how is not None and how.name == name else self._unused(name)
         learned = self._newest = Learned(name, label, changes, self._changed(steps))
-        content = Known(name, "learned", concept, concept.concept, "", learned, demonstrations, task, former=former)
+        content = Known(name, "learned", concept, concept.concept, "", learned, demonstrations, task, former=former, source=source)
         known, found = self._measured(content, concept)
-        more = self._settings(False) != (changes, steps)
-        kept = self._keep(request.replaces or f"l{self._count}", known)
-        tell(kept | found | {"seconds": round(monotonic() - begin, 2), "more": more})
+        if stopped():
+            raise Stopped
+        kept = self._keep(key or f"l{self._count}", replace(known, seconds=round(monotonic() - begin, 2)))
+        tell(kept | found | {"more": self._settings(False) != (changes, steps)})
 
     def restore(self, request: requests.Named) -> Json:
         """Undo that a concept was learned again from other demonstrations: return the former one, its samples and their quality."""

@@ -80,10 +80,40 @@ def test_samples_grow_out_of_the_strokes_until_somebody_draws(strokes: Browser) 
     grown = strokes.js("[recorder.grown.strokes.length, shapesNow(recorder.grown)[0], lineOf(learning.samples[0])]")
     assert grown[0] == 5
     assert grown[1] == grown[2]
-    stroke(strokes)
-    assert strokes.js("recorder.grown === null || learning.stop !== null || justLearned()")
+    picture = "document.getElementById('show').toDataURL()"
+    strokes.until(lambda: strokes.js("!learning.again"))
+    shown = strokes.js(picture)
+    strokes.drag(strokes.places([(0.0, 0.0), (0.0, 0.0)]))  # a dot changes nothing
+    assert strokes.js(picture) == shown
     cleared(strokes)
     assert strokes.js("recorder.grown") is None
+    assert strokes.js(picture) != shown
+    strokes.undo()
+    strokes.until(lambda: strokes.count("#slots canvas") == 5)
+    assert strokes.js("justLearned()"), "the concept belongs to these strokes again"
+
+
+def test_undo_goes_back_step_by_step(strokes: Browser) -> None:
+    cleared(strokes)
+    for number in range(5):
+        stroke(strokes, 0.2 + 0.02 * number)
+    learned(strokes)
+    name, key, count = strokes.js("[learning.concept.name, learning.concept.id, state.concepts.length]")
+    stroke(strokes, 0.25)
+    learned(strokes)
+    strokes.until(lambda: strokes.js("!learning.again"))
+    assert strokes.js("[learning.concept.name, learning.concept.id, state.concepts.length]") == [name, key, count]
+    strokes.js("(undo(), undo(), 1)")  # the former concept, then the sixth stroke
+    strokes.until(lambda: strokes.count("#slots canvas") == 5)
+    assert strokes.text("error-text") == ""
+    assert strokes.js("justLearned() && conceptOf(learning.concept.id).from.length") == 5
+    assert strokes.text("waiting").startswith(f"Learned “{name}” in")
+    strokes.click("learn")
+    strokes.js("(undo(), 1)")  # while it is learned: this ends, and the fifth stroke goes
+    strokes.until(lambda: strokes.count("#slots canvas") == 4)
+    assert strokes.data("learning") == "no"
+    assert strokes.js("conceptOf(arguments[0]).from.length", key) == 5
+    assert strokes.errors() == []
 
 
 def test_the_first_stroke_moves_nothing(strokes: Browser) -> None:
@@ -200,7 +230,7 @@ def test_what_is_learned_is_mixed_forgotten_and_renamed(page: Browser) -> None:
     assert page.count("#mix li") == 1
     assert page.count("#learned") == page.count("#samples canvas") == 0
     assert page.text("error-text") == ""
-    assert page.js("find('name').value") == "my stroke 2"  # the next one's
+    assert page.js("find('name').value") == "my stroke 1"  # which was learned from the same strokes
     # Called otherwise.
     page.click("learn")
     learned(page)

@@ -42,7 +42,8 @@ def body(height: float) -> Json:
 
 
 def state(**other: Any) -> Json:
-    about = {"kind": "training", "count": None, "form": "", "accuracy": None, "hash": "0" * 16}
+    about = {"kind": "training", "count": None, "form": "", "accuracy": None, "hash": "0" * 16, "from": []}
+    concepts = [{"id": f"c{number}", "name": name, **about} for number, name in enumerate(("line", "arc", "circle"))]
     flags = ["It is short."]
     shown = [{"id": number, "film": line(stroke), "flags": flags} for number, stroke in enumerate(strokes("heart", 5, 0))]
     same = {"python": "", "command": ""}
@@ -56,8 +57,15 @@ def state(**other: Any) -> Json:
         "executes": False,
         "groups": [],
         "temperature": TEMPERATURE,
-        "concepts": [{"id": f"c{number}", "name": name, **about} for number, name in enumerate(("line", "arc", "circle"))],
-        "work": {"demonstrations": shown, "check": ["They are much alike."], "undo": False, "same": same, "wanted": 5},
+        "concepts": concepts,
+        "work": {
+            "demonstrations": shown,
+            "check": ["They are much alike."],
+            "undo": False,
+            "same": same,
+            "wanted": 5,
+            "concepts": concepts,
+        },
         "viewer": None,
         "offline": {"weights": WEIGHTS, "pairs": [["c0", "c1"]]},
         **other,

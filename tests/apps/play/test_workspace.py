@@ -193,7 +193,10 @@ def test_a_concept_learned_again_replaces_the_former_which_comes_back(
     assert len(after.state()["concepts"]) == len(before)
     assert after.concept_file(key)[0] == former[0]
     assert after.concept_file(key)[1] != former[1]
-    back = after.restore(requests.Named(key))
+    after.rename(requests.Renamed(key, "mine"))
+    assert after.restore(requests.Named(key))["concept"]["name"] == "mine"
+    after.rename(requests.Renamed(key, TASK))
+    back = {"concepts": after.state()["concepts"]}
     assert back["concepts"] == before
     assert after.concept_file(key) == former
     with pytest.raises(UserError, match="expected a concept with a former version"):
