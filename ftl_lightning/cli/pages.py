@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ftl_lightning.services.errors import require
 from ftl_lightning.services.text import say
@@ -81,7 +81,10 @@ def _write_static(workspace: "Workspace", path: Path, pairs: "list[tuple[str, st
     from ftl_lightning.services.progress import bar
 
     if workspace.work()["demonstrations"]:
-        workspace.learn(Learn(workspace.suggestion), lambda progress: None, lambda: False)
+        told: list[Any] = []
+        workspace.learn(Learn(workspace.suggestion), told.append, lambda: False)
+        if told[-1]["more"]:
+            workspace.learn(Learn(again=told[-1]["concept"]["id"]), told.append, lambda: False)
     with bar(f"{path.name}: mixes", (len(pairs) or PAIRS) * len(WEIGHTS) ** 2) as advance:
         size = write_offline(workspace, path, pairs, lambda: advance(1, ""))
     say(f"{path}: {size / 1e6:.1f} MB")

@@ -26,13 +26,13 @@ async function renew(found, anew = false) {
 
 function setOffline() {
   const before = Boolean(state.offline), some = state.work.demonstrations.length > 0;
-  for (const id of ["hint", "canvas", "ways", "learning"]) find(id).hidden = before;
+  for (const id of ["hint", "canvas", "edit", "ways", "learning"]) find(id).hidden = before;
   find("made-before").hidden = !before;
   find("showing").hidden = before && !some;
   if (before) {
     find("showing-title").textContent = `${many(state.work.demonstrations.length, "recorded demonstration")}`;
     find("mix-title").textContent = "Mix";
-    find("steps").classList.add("one");
+    find("steps").classList.add("bare", "one");
   }
 }
 
