@@ -5,7 +5,7 @@ table. The HPARAMS tab reads the means from charts with a single point, which co
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -127,4 +127,7 @@ def log_projector(logger: TensorBoardLogger, points: Sequence[Point], step: int)
     if points:
         embeddings = torch.stack([point.embedding.cpu() for point in points])
         table = [[line(point.text), point.set, *labels(point.part)] for point in points]
-        logger.experiment.add_embedding(embeddings, metadata=table, metadata_header=list(COLUMNS), global_step=step, tag="concepts")
+        with redirect_stdout(None):  # it prints a warning where a former run wrote one
+            logger.experiment.add_embedding(
+                embeddings, metadata=table, metadata_header=list(COLUMNS), global_step=step, tag="concepts"
+            )
