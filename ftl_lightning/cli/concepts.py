@@ -347,5 +347,5 @@ def explain(concept: str, pretrained: str = "", nearest: int = 3) -> None:
         parts += [(f"weighted sum{knot}", embedding) for knot, embedding in whole.items()]
     for name, embedding in parts[:MOST_PARTS]:
         say(f"{name}: {explained(embedding, names, model.training_embeddings, nearest)}")
-    if rest := len(parts) - MOST_PARTS:
-        say(f"{rest} more embeddings, of other knots, modes and components") if rest > 0 else None
+    if rest := parts[MOST_PARTS:]:
+        say(f"{len(rest)} more embeddings, of other knots, modes and components")

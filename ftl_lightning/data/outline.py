@@ -63,9 +63,8 @@ class Outline:
         """
         if len(demonstrations) < 2 or not self.rows:
             return None
-        known, its = first_windows(demonstrations, self.horizon), vectors_of(demonstrations)
-        seen = {name: observed[name].flatten(1).float() for name in its}
-        frames, finite = Frames.fit(known, its, self.setting.places), paths.isfinite().flatten(1).all(dim=1)
+        known, its, seen, frames = self._compared(observed, demonstrations)
+        finite = paths.isfinite().flatten(1).all(dim=1)
         made = self._points(frames, torch.where(finite[:, None, None], paths, 0), seen)
         return finite & (_farther(made, self._points(frames, known, its)) <= self.limit(len(known)))
 
@@ -73,9 +72,8 @@ class Outline:
         """For each path, its added parts, and the missing parts of the nearest demonstration, moved to the path: ``(point, state)``
         each. Arguments as for :meth:`whole`, which judges them; paths must be finite.
         """
-        known, its = first_windows(demonstrations, self.horizon), vectors_of(demonstrations)
-        seen = {name: observed[name].flatten(1).float() for name in its}
-        frames, width = Frames.fit(known, its, self.setting.places), paths.shape[2]
+        known, its, seen, frames = self._compared(observed, demonstrations)
+        width = paths.shape[2]
         made, base = self._points(frames, paths, seen), self._points(frames, known, its)
         limit = _usual(base) * math.exp(self.limit(len(known)))
         apart = torch.cdist(made[:, None], base[None])
@@ -90,6 +88,12 @@ class Outline:
                 moved = path.mean(dim=0) + (other - other.mean(dim=0)) * self._size(path) / self._size(other)
             parts.append([*_runs(path, forth[row, demo] > limit), *_runs(moved, back[row, demo] > limit)])
         return parts
+
+    def _compared(self, observed: Observed, demonstrations: Demonstrations) -> tuple[Tensor, Observed, Observed, Frames]:
+        """Windows of the demonstrations, vectors observed by these and by paths, and the frames of the demonstrations."""
+        known, its = first_windows(demonstrations, self.horizon), vectors_of(demonstrations)
+        seen = {name: observed[name].flatten(1).float() for name in its}
+        return known, its, seen, Frames.fit(known, its, self.setting.places)
 
     def _size(self, path: Tensor) -> Tensor:
         """Root mean square of a path ``(horizon, state)`` around its mean."""

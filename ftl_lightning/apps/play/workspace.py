@@ -128,8 +128,6 @@ class Workspace:
         self._concepts = {
             f"t{number}": Known(text, "training", self._model[text]) for number, text in enumerate(self._model.training_concepts)
         }
-        examples = self._model.model.examples
-        self._outliers = None if examples is None else Outliers(examples, self._model.model.horizon, self._model.model.places)
         learned = self._model.library().learned
         for number, entry in enumerate(learned):
             concept = self._model.load(str(entry.path))
@@ -140,6 +138,12 @@ class Workspace:
         trained = {known.name: known.composition for known in self._concepts.values() if not known.concept}
         replacing = shipped | trained if root is None else {}  # a folder that cannot be read is reported
         self._demonstrating = Demonstrating(self._model, self._domain.source(root), replacing)
+
+    @functools.cached_property
+    def _outliers(self) -> Outliers | None:
+        """Judge of demonstrations that belong to another concept; ``None`` for a shipped domain."""
+        model = self._model.model
+        return None if model.examples is None else Outliers(model.examples, model.horizon, model.places)
 
     def state(self) -> dict[str, Any]:
         """Initial state of the page."""
@@ -323,7 +327,8 @@ class Workspace:
         if self._model.settings == OWN or not (same or _fewer(known.accuracy, before.accuracy)):
             self._newest = learned if self._newest is former else self._newest
             found |= self._keep(key, known)
-        warned = [] if self._outliers is None else several_concepts(self._model.model, demonstrations, self._outliers)
+        outliers = self._outliers
+        warned = [] if outliers is None else several_concepts(self._model.model, demonstrations, outliers)
         tell({"done": True, "seconds": round(monotonic() - begin, 2), "check": warned} | found)
 
     def _invert(

@@ -17,7 +17,8 @@ from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.services.randomness import generator, task_key
 
 COPIES, COLLAPSED, SMOOTHED = 0.2, 0.5, 0.67
-"""Minimum novelty, spread and roughness; fresh demonstrations of ten data sets of own data have a roughness of 0.67 or more."""
+"""Minimum novelty, spread and roughness. Fresh demonstrations of ten data sets lie within the limits of roughness, see
+benchmarks/experiments/roughness.py."""
 SCATTERED, ROUGH = 2.0, 1.5
 """Maximum spread and roughness."""
 THAN = "than your demonstrations"
